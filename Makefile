@@ -33,14 +33,15 @@ BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13 b
 # One interpreter for every build, or PyO3 is built again.
 export PYO3_PYTHON := $(abspath $(BIN)/python)
 
-.PHONY: help build wheel demo plugin stubs docs test test-wheel test-rust test-python test-mujoco test-newton test-validator test-blender test-capture fuzz lint format clean
+.PHONY: help build wheel demo plugin stubs docs test test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-blender test-capture fuzz lint format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
 	@echo "make wheel   a wheel for other machines, into $(DIST): Linux with glibc 2.28 or newer; zig is downloaded (100 MB)"
 	@echo "make demo    train, evaluate, export, query and render the small capture into $(OUT)"
 	@echo "make plugin  the Blender extension, into out/"
-	@echo "make test    all tests, Rust and Python"
+	@echo "make test    all tests but the long ones, Rust and Python"
+	@echo "make test-long   the long ones: fits of whole objects"
 	@echo "make fuzz    damaged files for every reader, MINUTES=60 long; READER= picks one"
 	@echo "make test-mujoco, test-newton, test-blender   tests with these tools, which are downloaded (75 MB, 300 MB, 1.5 GB)"
 	@echo "make test-validator   NVIDIA's validator on our stages, which is downloaded (50 MB)"
@@ -110,17 +111,16 @@ test-wheel: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps $(ONNXRUNTIME)
 	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check --force-reinstall --no-deps $(TEST_WHEELS)/*.whl
 
-# What cif-usd writes and reads is tested in a Python that has usd-core.
-RUST_TESTS = PYTHONPATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))') \
-	LD_LIBRARY_PATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_config_var("LIBDIR"))') \
-	cargo test --locked --no-fail-fast --features cif-usd/python,cif-vision/onnx
-
-test-rust: test-wheel
-	$(RUST_TESTS)
-
+# What cif-usd writes and reads is tested in a Python that has usd-core. Long tests are whole fits of objects and runs that
+# others cover in part; `make test-long` runs them.
+test-long: SELECTION := -- --ignored
 # The tests that compare docs/reference with the code write it instead.
-docs: test-wheel
-	CIF_WRITE_DOCS=1 $(RUST_TESTS) --test across reference::
+docs: SELECTION := --test across reference::
+docs: export CIF_WRITE_DOCS := 1
+test-rust test-long docs: test-wheel
+	PYTHONPATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))') \
+	LD_LIBRARY_PATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_config_var("LIBDIR"))') \
+	cargo test --locked --no-fail-fast --features cif-usd/python,cif-vision/onnx $(SELECTION)
 
 test-python: test-wheel
 	$(TEST_BIN)/python -m pytest

@@ -1,10 +1,11 @@
-"""Everything public is documented at run time, and the stub has the same names, parameters and words."""
+"""What is public is documented, the stub agrees with it, and links of pages lead somewhere."""
 
 from __future__ import annotations
 
 import ast
 import importlib.util
 import inspect
+import re
 from pathlib import Path
 
 import cif
@@ -12,7 +13,8 @@ import cif.usd
 import pytest
 from cif import _native
 
-PACKAGE = Path(__file__).parents[2] / "crates" / "cif-python"
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "crates" / "cif-python"
 spec = importlib.util.spec_from_file_location("stubs", PACKAGE / "stubs.py")
 stubs = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(stubs)
@@ -52,3 +54,37 @@ def test_the_stub_has_the_same_names_and_parameters() -> None:
         assert by_place == [argument.arg for argument in arguments.args], name
         defaults = [default for default in [*arguments.defaults, *arguments.kw_defaults] if default]
         assert sum(p.default is not p.empty for p in parameters) == len(defaults), name
+
+
+def anchors(page: Path) -> set[str]:
+    """Names of the headings of a page, as links to them are spelt."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+PAGES = [
+    *ROOT.glob("*.md"),
+    *(
+        p
+        for f in ["docs", "crates", "examples", "plugin", "schemas", "tests"]
+        for p in (ROOT / f).rglob("*.md")
+    ),
+]
+
+
+@pytest.mark.parametrize("page", sorted(PAGES), ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if re.match(r"[a-z]+:", link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), f"{link}: no such file"
+        assert not anchor or anchor in anchors(target), f"{link}: no such heading"
+
+
+def test_the_list_of_pages_has_all_of_them() -> None:
+    listed = set(
+        re.findall(r"^\| \[[^]]+\]\(([^)]+)\)", (ROOT / "docs" / "README.md").read_text(), re.MULTILINE)
+    )
+    assert listed == {page.name for page in (ROOT / "docs").glob("*.md")} - {"README.md"}

@@ -4,7 +4,8 @@
 //! |---|---|
 //! | [`scalar`] | which number type a formula runs in (`f32` or `f64`) |
 //! | [`transform`] | rigid transforms `a_from_b` |
-//! | [`similarity`] | similarities between worlds, and the one that fits places best |
+//! | [`align`] | rigid transforms and similarities that align point sets |
+//! | [`stats`] | medians and quantiles |
 //! | [`quaternion`] | rotation of a (w, x, y, z) quaternion, with derivative |
 //! | [`spherical_harmonics`] | view-dependent colour basis, degrees 0 to 3, with derivative and rotation |
 //! | [`camera`] | ideal pinhole cameras |
@@ -18,6 +19,7 @@
 //! Conventions: right-handed world; camera frame x right, y down, z forward (OpenCV); pixel (i, j) has its
 //! centre at (i + 0.5, j + 0.5); quaternions are (w, x, y, z) in memory; matrices act on column vectors.
 
+pub mod align;
 pub mod bounds;
 pub mod camera;
 pub mod capture_frame;
@@ -26,17 +28,17 @@ pub mod lens;
 pub mod overlap;
 pub mod quaternion;
 pub mod scalar;
-pub mod similarity;
 pub mod spherical_harmonics;
+pub mod stats;
 pub mod transform;
 pub mod up_axis;
 
+pub use align::similarity::Similarity;
 pub use bounds::Bounds;
 pub use camera::PinholeCamera;
 pub use capture_frame::CaptureFrame;
 pub use grid::PixelGrid;
 pub use lens::LensDistortion;
 pub use scalar::Real;
-pub use similarity::Similarity;
 pub use transform::RigidTransform;
 pub use up_axis::UpAxis;

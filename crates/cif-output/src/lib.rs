@@ -21,6 +21,6 @@ mod workplace;
 
 pub use name::{check_name, check_taxonomy, inside};
 pub use place::{Place, folder_of, place, target};
-pub use shared::{check_private, open_own, private_folder};
+pub use shared::{check_of_owner, check_private, open_own, private_folder};
 pub use unfinished::{NewFile, Removed, Scratch, abandon, finish_all, probe, write};
 pub use workplace::Workplace;

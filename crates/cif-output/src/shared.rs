@@ -65,22 +65,50 @@ pub fn private_folder(path: &Path) -> io::Result<()> {
 /// # Errors
 /// As [`private_folder`], and when it is missing.
 pub fn check_private(path: &Path) -> io::Result<()> {
+    check(path, 0o022, |_| false)
+}
+
+/// Checks that a folder inside another one was made by this user or by whoever owns the other one, and that not everybody
+/// may write into it.
+///
+/// # Errors
+/// When that is not so, it is a link or missing, or the system refuses.
+pub fn check_of_owner(path: &Path, outer: &Path) -> io::Result<()> {
+    let outer = fs::metadata(outer)?;
+    check(path, 0o002, |found| is_same_owner(found, &outer))
+}
+
+/// Checks that a folder is this user's, or is let by, and that nobody else may write into it, by the bits of its mode.
+fn check(path: &Path, others: u32, is_let_by: impl FnOnce(&fs::Metadata) -> bool) -> io::Result<()> {
     let found = fs::symlink_metadata(path)?;
     if !found.is_dir() {
-        return Err(planted("no folder"));
+        return Err(planted(if found.is_symlink() { "a link" } else { "no folder" }));
     }
     #[cfg(unix)]
     {
         use std::os::unix::fs::MetadataExt;
         let refused = |problem: &str| io::Error::new(io::ErrorKind::PermissionDenied, problem.to_owned());
-        if found.uid() != rustix::process::geteuid().as_raw() {
+        if found.uid() != rustix::process::geteuid().as_raw() && !is_let_by(&found) {
             return Err(refused("it belongs to another user, so what is in it is not taken"));
         }
-        if found.mode() & 0o022 != 0 {
+        if found.mode() & others != 0 {
             return Err(refused("other users may write into it, so what is in it is not taken; remove it"));
         }
     }
+    #[cfg(not(unix))]
+    let _ = (others, is_let_by);
     Ok(())
+}
+
+#[cfg(unix)]
+fn is_same_owner(a: &fs::Metadata, b: &fs::Metadata) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    a.uid() == b.uid()
+}
+
+#[cfg(not(unix))]
+fn is_same_owner(_: &fs::Metadata, _: &fs::Metadata) -> bool {
+    true
 }
 
 #[cfg(all(test, unix))]
@@ -117,5 +145,30 @@ mod tests {
         assert!(private_folder(&path).unwrap_err().to_string().contains("other users may write"));
         symlink(folder.path(), folder.path().join("link")).unwrap();
         assert!(private_folder(&folder.path().join("link")).is_err());
+    }
+
+    #[test]
+    fn folders_inside_others_are_this_users_or_those_of_the_owner() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("cache");
+        fs::create_dir(&path).unwrap();
+        let check = || check_of_owner(&path, folder.path()).map_err(|error| error.to_string());
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o775)).unwrap();
+        assert_eq!(check(), Ok(()));
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o777)).unwrap();
+        assert!(check().unwrap_err().contains("other users may write"));
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
+        // Only the administrator can give folders away.
+        if rustix::process::geteuid().is_root() {
+            std::os::unix::fs::chown(&path, Some(12345), None).unwrap();
+            assert!(check().unwrap_err().contains("belongs to another user"));
+            assert!(check_private(&path).is_err());
+            std::os::unix::fs::chown(folder.path(), Some(12345), None).unwrap();
+            assert_eq!(check(), Ok(()), "whoever owns the capture");
+            assert!(check_private(&path).is_err());
+        }
+        let link = folder.path().join("link");
+        symlink("cache", &link).unwrap();
+        assert!(check_of_owner(&link, folder.path()).unwrap_err().to_string().contains("it is a link"));
     }
 }

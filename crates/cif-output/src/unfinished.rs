@@ -121,11 +121,11 @@ impl Unfinished {
         }
         let mut builder = tempfile::Builder::new();
         builder.prefix(PREFIX).rand_bytes(12);
-        // Temporary files are private by default; the result should have the usual permissions.
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+        // Temporary files are private by default; the result should have the usual permissions. Errors are those of the
+        // system, for the temporary name says nothing to anybody.
+        let create = |path: &Path| OpenOptions::new().read(true).write(true).create_new(true).open(path);
         loop {
-            let (file, path) = builder.tempfile_in(folder)?.keep().map_err(|error| error.error)?;
+            let (file, path) = builder.make_in(folder, create)?.keep().map_err(|error| error.error)?;
             // Another process may have taken it for a dead one's before it was locked, and removes it. Where the file
             // system has no locks nobody can, and nobody does.
             let taken = matches!(file.try_lock(), Err(fs::TryLockError::WouldBlock));
@@ -282,11 +282,11 @@ impl Scratch {
 
     /// Moves files and folders of this scratch, `(from, to)`, to their places, one after the other, the one that
     /// names the others last; [`abandon`] waits for it. Existing files and folders at these places are removed, and
-    /// so is the folder `unneeded`. When something fails, everything is as it was.
+    /// so are those that are `unneeded`. When something fails, everything is as it was.
     ///
     /// # Errors
     /// When the file system refuses a rename.
-    pub fn replace(self, moves: &[(PathBuf, PathBuf)], unneeded: Option<&Path>) -> io::Result<()> {
+    pub fn replace(self, moves: &[(PathBuf, PathBuf)], unneeded: &[PathBuf]) -> io::Result<()> {
         let live = live();
         // What was renamed, in order: from, to.
         let mut done: Vec<(PathBuf, PathBuf)> = Vec::new();
@@ -304,7 +304,8 @@ impl Scratch {
                 }
                 rename(from, to)?;
             }
-            unneeded.map_or(Ok(()), |folder| rename(folder, &self.file("unneeded")))
+            let mut unneeded = unneeded.iter().enumerate();
+            unneeded.try_for_each(|(number, path)| rename(path, &self.file(&format!("unneeded-{number}"))))
         };
         let result = all();
         if result.is_err() {
@@ -371,7 +372,7 @@ mod tests {
         let scratch = Scratch::inside(folder.path()).unwrap();
         fill(&scratch);
         let from = scratch.file("usda");
-        scratch.replace(&[(from, folder.path().join("out.usda"))], None).unwrap();
+        scratch.replace(&[(from, folder.path().join("out.usda"))], &[]).unwrap();
         assert_eq!(names(folder.path()), ["out.usda"]);
     }
 
@@ -389,17 +390,17 @@ mod tests {
         };
         for text in ["one", "two"] {
             let (scratch, arrays, root) = write(text);
-            scratch.replace(&[(arrays, at("payloads")), (root, at("out.usda"))], None).unwrap();
+            scratch.replace(&[(arrays, at("payloads")), (root, at("out.usda"))], &[]).unwrap();
             assert_eq!((read("payloads/a.usdc").as_str(), read("out.usda").as_str()), (text, text));
         }
         // The second move fails, so the first is undone.
         let (scratch, arrays, _) = write("three");
         let missing = at("missing");
-        assert!(scratch.replace(&[(arrays, at("payloads")), (missing, at("out.usda"))], None).is_err());
+        assert!(scratch.replace(&[(arrays, at("payloads")), (missing, at("out.usda"))], &[]).is_err());
         assert_eq!((read("payloads/a.usdc").as_str(), read("out.usda").as_str()), ("two", "two"));
         // A file alone makes the folder beside it unneeded.
         let (scratch, _, root) = write("four");
-        scratch.replace(&[(root, at("out.usda"))], Some(&at("payloads"))).unwrap();
+        scratch.replace(&[(root, at("out.usda"))], &[at("payloads")]).unwrap();
         assert_eq!((names(folder.path()), read("out.usda").as_str()), (vec!["out.usda".to_owned()], "four"));
     }
 

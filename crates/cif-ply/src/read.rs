@@ -3,6 +3,7 @@
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
+use cif_geometry::scalar::direct_sigmoid;
 use cif_geometry::spherical_harmonics::{BAND_0, coefficient_count};
 use cif_geometry::{Bounds, quaternion};
 use cif_scene::assemble::{Prim, Prims, assemble, color_range, origin_of};
@@ -408,7 +409,7 @@ impl Collected {
         self.centres.push([slots[POSITION], slots[POSITION + 1], slots[POSITION + 2]]);
         splats.orientations.push(rotation);
         splats.scales.push(scale);
-        splats.opacities.push(1.0 / (1.0 + (-single[OPACITY]).exp()));
+        splats.opacities.push(direct_sigmoid(single[OPACITY]));
         splats.sh_coefficients.extend_from_slice(harmonics);
         splats.occupancies.push(1.0);
         splats.identity_probabilities.push(1.0);

@@ -118,7 +118,8 @@ pub(crate) fn export<'py>(
     let scene = scene_options(py, scene)?;
     format.check_target(path, &writing).map_err(cif_error)?;
     let graph = build(py, field, &format.held(&scene), motion)?;
-    let summary = process::detach(py, || format.write(&graph, path, &writing))?.map_err(cif_error)?;
+    let summary = process::detach(py, || formats::write(format, &graph, path, &writing))?
+        .map_err(|error| cif_error(error.with_help()))?;
     let out = PyDict::new(py);
     out.set_item("path", summary.path)?;
     out.set_item("files", summary.files)?;

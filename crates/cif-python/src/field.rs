@@ -3,6 +3,8 @@
 use std::path::PathBuf;
 use std::sync::OnceLock;
 
+use cif::lock::Lock;
+use cif::output;
 use cif_field::{Gaussians, RecordedCamera};
 use cif_geometry::scalar::sigmoid;
 use cif_geometry::spherical_harmonics::COEFFICIENTS;
@@ -74,7 +76,12 @@ impl Field {
 
     /// Write a .cif file, replacing an older one only once the new one is complete.
     fn save(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
-        process::detach(py, || self.inner.save(&path))?.map_err(cif_error)
+        process::detach(py, || {
+            output::check_file(&path, true)?;
+            let _lock = Lock::wait(&path)?;
+            self.inner.save(&path).map_err(cif::Error::plain)
+        })?
+        .map_err(|error| cif_error(error.with_help()))
     }
 
     /// Make a static field.

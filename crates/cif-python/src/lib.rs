@@ -38,14 +38,19 @@ mod tables;
 mod train;
 
 use std::ffi::OsString;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use pyo3::prelude::*;
 
-/// Python that the command runs pycolmap in: this one.
+/// Python that the command runs pycolmap and models in: this one.
 fn name_python(py: Python<'_>) -> PyResult<()> {
-    if let Some(program) = py.import("sys")?.getattr("executable")?.extract::<Option<PathBuf>>()? {
-        cif::set_python(program);
+    let program: Option<PathBuf> = py.import("sys")?.getattr("executable")?.extract()?;
+    let module: PathBuf = py.import("cif")?.getattr("__file__")?.extract()?;
+    let packages = module.ancestors().nth(2).map(Path::to_owned);
+    // Programs that Python is built into have none, or an empty name.
+    let program = program.filter(|program| !program.as_os_str().is_empty());
+    if let (Some(program), Some(packages)) = (program, packages) {
+        cif::set_python(program, packages);
     }
     Ok(())
 }

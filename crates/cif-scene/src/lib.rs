@@ -7,13 +7,12 @@
 //! | [`joint`] | joints between the parts of a node |
 //! | [`world`] | where a graph lies in the world of its capture |
 //! | [`naming`] | names that every format accepts |
-//! | [`build::assignment`] | which node a Gaussian belongs to |
-//! | [`build::source`] | where the moved Gaussians come from |
-//! | [`build::frames`] | the moved Gaussians of every sampled time |
-//! | [`build::camera_tracks`] | recorded cameras as tracks over time |
+//! | [`from_field::assignment`] | which node a Gaussian belongs to |
+//! | [`from_field::source`] | where the moved Gaussians come from |
+//! | [`from_field::frames`] | the moved Gaussians of every sampled time |
+//! | [`from_field::camera_tracks`] | recorded cameras as tracks over time |
 //! | [`motion`] | how well standing still and one rigid body fit a group of Gaussians |
 //! | [`motion_scores`] | how well the motion of a graph follows known surface points |
-//! | [`motion::procrustes`] | robust rigid alignment of two point sets |
 //! | [`motion::parts`] | a few rigid parts, found by clustering the paths of Gaussians |
 //! | [`motion::keys`] | fewer samples of a track inside an error bound |
 //! | [`motion::placement`] | where a node's splats are at any time |
@@ -35,7 +34,7 @@
 //! | [`edits`] | what was changed in an exported file, applied to the field it came from |
 //! | [`format`](mod@format) | what a file format does for graphs |
 //! | [`assemble`](mod@assemble) | graphs from what readers find in files |
-//! | [`field_from_graph`] | the way back: Gaussians, recorded motion and instances of a graph |
+//! | [`to_field`] | the way back: Gaussians, recorded motion and instances of a graph |
 //!
 //! Frames: world as captured (right-handed, metres), or a frame of the scene's own in it (see [`world`]). A node's
 //! splats live in its local frame, whose axes are the world's and whose origin is the node's pivot at the reference
@@ -43,13 +42,13 @@
 
 pub mod appearance;
 pub mod assemble;
-pub mod build;
+
 pub mod diff;
 pub mod edits;
 pub mod error;
-pub mod field_from_graph;
 pub mod files;
 pub mod format;
+pub mod from_field;
 pub mod graph;
 pub mod joint;
 pub mod motion;
@@ -63,18 +62,18 @@ pub mod shape;
 mod testing;
 #[cfg(test)]
 mod tests;
+pub mod to_field;
 pub mod world;
 
-pub use build::source::MotionSource;
-pub use build::{build, build_from};
 pub use diff::{ChangeKind, ObjectChange, SceneDiff};
 pub use edits::import_edits;
 pub use error::SceneError;
-pub use field_from_graph::{field_from_graph, time_in_field};
 pub use format::{
     About, Ending, ExportOptions, ExportSummary, FormatError, Ground, Payloads, ReadOptions, Relabelled,
     SceneFormat,
 };
+pub use from_field::source::MotionSource;
+pub use from_field::{build, build_from};
 pub use graph::{
     Appearance, AppearanceSample, CameraSample, CameraTrack, CodeRange, ConvexHull, DenseMotion, DenseSample,
     IdentityShare, IdentityShares, Motion, MotionModel, Node, NodeKind, Origin, Part, PartsMotion,
@@ -95,6 +94,7 @@ pub use shape::extent;
 pub use shape::ground::ground_height;
 pub use shape::level_of_detail::level_of_detail;
 pub use shape::mass::{DENSITY, masses};
+pub use to_field::{field_from_graph, time_in_field};
 pub use world::frame_of;
 
 /// Where coordinates lie in the world of the capture; see [`world`].

@@ -105,7 +105,7 @@ pub struct SceneOptions {
     /// Gaussians below this occupancy are left out. Default 0: none.
     pub min_occupancy: f32,
     /// Gaussians whose instance mass (occupancy times probability of the most probable instance) is below
-    /// this are background, unless they are enclosed by an instance (see [`crate::build::assignment`]). Default 0:
+    /// this are background, unless they are enclosed by an instance (see [`crate::from_field::assignment`]). Default 0:
     /// the share of labelled pixels decides alone. Colour is drawn by opacity, so that many splats of an object keep
     /// occupancies near their start of 0.02; a threshold above leaves their colour behind when the object moves.
     pub background_threshold: f32,

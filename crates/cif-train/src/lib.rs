@@ -8,16 +8,15 @@
 //! | [`events`] | what a run reports |
 //! | [`phase`], [`phases`] | where the time of a run goes, how far it is, and whether it may go on |
 //! | [`stop`] | how a run is asked to stop |
-//! | [`schedule`] | learning rates, spherical-harmonics degree |
+//! | [`schedule`] | the stages, what falls on which step (one table), rates over the steps |
 //! | [`losses`] | colour losses and their gradients |
 //! | [`fit`] | settings that fit a time budget |
 //! | [`budget`] | how a run fits into the time there is |
 //! | [`curve`] | what a run had reached when |
 //! | [`clock`] | where it reads time |
 //! | [`adam`] | the optimiser, and the regularisers of the planes |
-//! | [`densify`] | cloning, splitting, pruning |
+//! | [`density`] | which Gaussians come and go: densification strategies, relocation to instances with volume conservation |
 //! | [`estimate`] | whose each Gaussian is, from masks |
-//! | [`resample`] | instance-guided resampling with volume conservation |
 //! | `engine` | what computes the steps of a run: the processor, or a GPU |
 //! | `objects` | how rigid objects get poses, before the scene is trained |
 //! | [`heads`] | what the instance stage learns, and how pixels tell it |
@@ -51,7 +50,7 @@ pub mod budget;
 pub mod clock;
 pub mod config;
 pub mod curve;
-pub mod densify;
+pub mod density;
 mod engine;
 pub mod error;
 pub mod estimate;
@@ -75,7 +74,6 @@ pub mod plan;
 mod poses;
 mod progress;
 mod random;
-pub mod resample;
 pub mod schedule;
 mod sightings;
 pub mod stage;

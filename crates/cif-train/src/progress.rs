@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::clock::Seconds;
-use crate::config::{HeadName, TrainConfig};
 use crate::curve::{Curve, Targets};
 use crate::exposure::Exposures;
 use crate::guard::Rollbacks;
@@ -207,98 +206,5 @@ impl Progress {
             times.iter().filter(|(name, _)| !measuring.contains(&name.as_str())).map(|(_, s)| s).sum()
         };
         Seconds { wall_s: sum(&self.wall_s), cpu_s: sum(&self.cpu_s) }
-    }
-}
-
-/// Properties of the capture that decide which stages a run has.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Stages {
-    /// More than one time.
-    pub is_dynamic: bool,
-    /// Masks with labelled pixels.
-    pub has_instances: bool,
-}
-
-impl Stages {
-    /// Steps of a stage.
-    pub(crate) fn iterations(self, config: &TrainConfig, stage: Stage) -> u32 {
-        match stage {
-            Stage::Coarse if self.is_dynamic => config.stages.coarse,
-            Stage::Fine if self.is_dynamic => config.fine_iterations(),
-            Stage::Fine => config.stages.coarse.saturating_add(config.fine_iterations()),
-            // Labels are counted before its first step.
-            Stage::Instance if config.head.name == HeadName::DrSplat => 0,
-            Stage::Instance if self.has_instances => config.stages.instance,
-            _ => 0,
-        }
-    }
-
-    /// The first stage with something to do from `stage` on.
-    pub(crate) fn from(self, config: &TrainConfig, stage: Stage) -> Stage {
-        [Stage::Coarse, Stage::Fine, Stage::Identity, Stage::Instance]
-            .into_iter()
-            .filter(|candidate| *candidate >= stage)
-            .find(|candidate| match candidate {
-                Stage::Identity => self.has_instances,
-                _ => self.iterations(config, *candidate) > 0,
-            })
-            .unwrap_or(Stage::Done)
-    }
-
-    /// The stage after `stage`.
-    pub(crate) fn after(self, config: &TrainConfig, stage: Stage) -> Stage {
-        let next = match stage {
-            Stage::Coarse => Stage::Fine,
-            Stage::Fine => Stage::Identity,
-            Stage::Identity => Stage::Instance,
-            Stage::Instance | Stage::Done => Stage::Done,
-        };
-        self.from(config, next)
-    }
-
-    /// Steps left after `iteration` steps of `stage`.
-    pub(crate) fn steps_left(self, config: &TrainConfig, stage: Stage, iteration: u32) -> u64 {
-        [Stage::Coarse, Stage::Fine, Stage::Instance]
-            .into_iter()
-            .filter(|other| *other >= stage)
-            .map(|other| u64::from(self.iterations(config, other)))
-            .sum::<u64>()
-            .saturating_sub(u64::from(iteration))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn stages_follow_what_the_capture_has() {
-        let config = TrainConfig::default();
-        let walk = |plan: Stages| {
-            let mut stages = vec![plan.from(&config, Stage::Coarse)];
-            while stages[stages.len() - 1] != Stage::Done {
-                stages.push(plan.after(&config, stages[stages.len() - 1]));
-            }
-            stages
-        };
-        use Stage::{Coarse, Done, Fine, Identity, Instance};
-        assert_eq!(
-            walk(Stages { is_dynamic: true, has_instances: true }),
-            [Coarse, Fine, Identity, Instance, Done]
-        );
-        assert_eq!(walk(Stages { is_dynamic: true, has_instances: false }), [Coarse, Fine, Done]);
-        let still = Stages { is_dynamic: false, has_instances: true };
-        assert_eq!(walk(still), [Fine, Identity, Instance, Done]);
-        assert_eq!(still.iterations(&config, Fine), config.stages.coarse + config.stages.fine);
-    }
-
-    #[test]
-    fn steps_left_count_later_stages() {
-        let mut config = TrainConfig::default();
-        (config.stages.coarse, config.stages.fine, config.stages.instance) = (10, 20, 5);
-        let plan = Stages { is_dynamic: true, has_instances: true };
-        assert_eq!(plan.steps_left(&config, Stage::Coarse, 4), 31);
-        assert_eq!(plan.steps_left(&config, Stage::Fine, 4), 21);
-        assert_eq!(plan.steps_left(&config, Stage::Done, 0), 0);
     }
 }

@@ -10,7 +10,7 @@ use cif_geometry::PixelGrid;
 use cif_render::{Blending, Gradients, InstanceSettings, RenderSettings, RenderedImage, UNLABELLED};
 
 use crate::config::TrainConfig;
-use crate::densify::DensifyStatistics;
+use crate::density::DensifyStatistics;
 use crate::error::TrainError;
 use crate::frames::{FrameStore, TrainFrame};
 use crate::guidance::{Guidance, Pulls};

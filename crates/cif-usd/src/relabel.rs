@@ -83,7 +83,7 @@ pub(crate) fn relabel(
         }
         Ok(done)
     })?;
-    scratch.replace(&[(copy, target)], None).map_err(unwritable)?;
+    scratch.replace(&[(copy, target)], &[]).map_err(unwritable)?;
     Ok(done)
 }
 

@@ -56,14 +56,7 @@ fn is_ours(pxr: &Pxr<'_>, path: &Path) -> bool {
 
 /// True when a folder holds nothing but layers of ours.
 fn is_folder_of_ours(pxr: &Pxr<'_>, folder: &Path) -> bool {
-    fs::read_dir(folder).is_ok_and(|mut entries| {
-        entries.all(|entry| {
-            entry.is_ok_and(|entry| {
-                let path = entry.path();
-                path.extension().is_some_and(|extension| extension == "usdc") && is_ours(pxr, &path)
-            })
-        })
-    })
+    by_writer(pxr, folder).is_ok_and(|[_, others]| others.is_empty())
 }
 
 pub(crate) fn check_target(path: &Path, options: ExportOptions) -> Result<(), UsdError> {
@@ -135,15 +128,14 @@ pub(crate) fn export(
             write(pxr, graph, &target, options, &folder).map_err(|error| failed(reason(pxr.py, &error)))?;
         let bytes = written.sync().map_err(system)?;
         let place = payloads_of(&target.path);
-        let unneeded = written.payloads.is_none() && place.is_dir() && is_folder_of_ours(pxr, &place);
-        let kept = match &written.payloads {
-            Some(payloads) => keep_foreign(pxr, &place, payloads).map_err(system)?,
-            None => Vec::new(),
+        let (unneeded, kept) = match &written.payloads {
+            Some(payloads) => (Vec::new(), keep_foreign(pxr, &place, payloads).map_err(system)?),
+            None => unneeded(pxr, &place).map_err(system)?.into(),
         };
         let mut moves: Vec<(PathBuf, PathBuf)> = Vec::new();
         moves.extend(written.payloads.map(|payloads| (payloads, place.clone())));
         moves.push((written.root, target.path));
-        scratch.replace(&moves, unneeded.then_some(place.as_path())).map_err(system)?;
+        scratch.replace(&moves, &unneeded).map_err(system)?;
         Ok(ExportSummary {
             path: path.to_owned(),
             files: vec![path.to_owned()],
@@ -163,13 +155,8 @@ pub(crate) fn export(
 /// # Errors
 /// When the file system refuses, or a new file has the name of such a file.
 fn keep_foreign(pxr: &Pxr<'_>, old: &Path, new: &Path) -> std::io::Result<Vec<PathBuf>> {
-    let mut kept = Vec::new();
-    for entry in fs::read_dir(old).into_iter().flatten() {
-        let from = entry?.path();
-        let is_layer = from.extension().is_some_and(|extension| extension == "usdc");
-        if is_layer && !from.is_symlink() && is_ours(pxr, &from) {
-            continue;
-        }
+    let [_, kept] = by_writer(pxr, old)?;
+    for from in &kept {
         let to = new.join(from.file_name().unwrap_or_default());
         if to.exists() {
             return Err(std::io::Error::other(format!(
@@ -177,11 +164,38 @@ fn keep_foreign(pxr: &Pxr<'_>, old: &Path, new: &Path) -> std::io::Result<Vec<Pa
                 from.display()
             )));
         }
-        take_over(&from, &to)?;
-        kept.push(from);
+        take_over(from, &to)?;
     }
-    kept.sort();
     Ok(kept)
+}
+
+/// What goes with an old folder of payloads that the new stage does without, and what stays: the folder, or where it
+/// holds files of others, ours among them.
+fn unneeded(pxr: &Pxr<'_>, old: &Path) -> std::io::Result<[Vec<PathBuf>; 2]> {
+    Ok(match by_writer(pxr, old)? {
+        [ours, others] if !ours.is_empty() && others.is_empty() => [vec![old.to_owned()], others],
+        [ours, others] if !ours.is_empty() => [ours, others],
+        // Nothing of ours was ever there.
+        _ => Default::default(),
+    })
+}
+
+/// Files of a folder of payloads that cif wrote, and everything else in it; none where there is no such folder.
+fn by_writer(pxr: &Pxr<'_>, folder: &Path) -> std::io::Result<[Vec<PathBuf>; 2]> {
+    let [mut ours, mut others] = [Vec::new(), Vec::new()];
+    if !folder.is_dir() {
+        return Ok([ours, others]);
+    }
+    for entry in fs::read_dir(folder)? {
+        let path = entry?.path();
+        let is_layer = path.extension().is_some_and(|extension| extension == "usdc");
+        let side =
+            if is_layer && !path.is_symlink() && is_ours(pxr, &path) { &mut ours } else { &mut others };
+        side.push(path);
+    }
+    ours.sort();
+    others.sort();
+    Ok([ours, others])
 }
 
 /// A second name of a file, or of all files of a folder; copies where the file system has no links.

@@ -1,5 +1,6 @@
 //! Errors of the command line, and its exit codes.
 
+use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
 use miette::{Diagnostic, NamedSource, SourceSpan};
@@ -32,16 +33,6 @@ pub enum Error {
     #[error(transparent)]
     #[diagnostic(transparent)]
     InText(Box<TextError>),
-    /// The file system refused.
-    #[error("cannot {action} {}: {source}", path.display())]
-    Io {
-        /// Action that failed, as in `read` or `write`.
-        action: &'static str,
-        /// To which file or folder.
-        path: PathBuf,
-        /// Why not.
-        source: std::io::Error,
-    },
     /// Ctrl-C, after saving (exit code 130).
     #[error("{message}")]
     Interrupted {
@@ -63,7 +54,7 @@ impl From<cif_render::wgpu::GpuError> for Error {
 impl From<cif_bench::Error> for Error {
     fn from(error: cif_bench::Error) -> Self {
         match error {
-            cif_bench::Error::Io { action, path, source } => Self::Io { action, path, source },
+            cif_bench::Error::Io { action, path, source } => Self::io(action, &path)(source),
             other => Self::plain(other),
         }
     }
@@ -78,7 +69,7 @@ impl From<cif_exr::ExrError> for Error {
 impl From<cif_vision::Error> for Error {
     fn from(error: cif_vision::Error) -> Self {
         match error {
-            cif_vision::Error::Io { action, path, source } => Self::Io { action, path, source },
+            cif_vision::Error::Io { action, path, source } => Self::io(action, &path)(source),
             cif_vision::Error::Refused { problem, fix } => Self::failed(problem, fix),
             other => Self::plain(other),
         }
@@ -116,10 +107,21 @@ impl Error {
         Self::Usage { message: plain(&message.into()).into_owned(), help: Some(help.into()) }
     }
 
-    /// Turns an I/O error into one that names the file.
-    pub fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+    /// Turns an I/O error into one that names the file, with advice where the system says enough.
+    pub fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
         let path = path.to_owned();
-        move |source| Self::Io { action, path, source }
+        move |source| {
+            let message = format!("cannot {action} {}: {source}", path.display());
+            let help = match source.kind() {
+                ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge => {
+                    "make space there, or choose another place"
+                }
+                ErrorKind::ReadOnlyFilesystem => "nothing can be written there; choose another place",
+                ErrorKind::PermissionDenied => "check the permissions of the file and of its folder",
+                _ => return Self::plain(message),
+            };
+            Self::failed(message, help)
+        }
     }
 
     /// A place in a text file, given as a byte range.

@@ -3,9 +3,10 @@
 use std::path::Path;
 
 use cif_field::Field;
-use cif_scene::{ReadOptions, SceneFormat, SceneGraph, SceneOptions};
+use cif_scene::{ExportOptions, ExportSummary, ReadOptions, SceneFormat, SceneGraph, SceneOptions};
 
 use crate::error::Error;
+use crate::lock::Lock;
 
 /// Every format that is read and written. A new one is a crate that implements [`SceneFormat`], and a line here.
 pub static FORMATS: [&dyn SceneFormat; 3] = [&cif_usd::Usd, &cif_gltf::Gltf, &cif_ply::Ply];
@@ -89,6 +90,20 @@ pub fn read(path: &Path, options: ReadOptions) -> Result<SceneGraph, Error> {
             Err(Error::usage(format!("{} is a scene of cif already", path.display()), advice()))
         }
     }
+}
+
+/// Writes a scene graph, while no other command changes the file.
+///
+/// # Errors
+/// When another command goes on changing it, and as [`SceneFormat::write`].
+pub fn write(
+    format: &dyn SceneFormat,
+    graph: &SceneGraph,
+    path: &Path,
+    options: &ExportOptions,
+) -> Result<ExportSummary, Error> {
+    let _lock = Lock::wait(path)?;
+    format.write(graph, path, options).map_err(Error::plain)
 }
 
 /// The field that shows what a file shows, as `cif import` makes it without a base.

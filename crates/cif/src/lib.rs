@@ -69,13 +69,18 @@ use miette::{GraphicalReportHandler, GraphicalTheme};
 pub use cif_capture::structure::pythons;
 pub use error::Error;
 
-/// Names the Python that this process is part of, which has the command as its module: programs of Python run in it, and so
-/// do models, each in a process of its own.
-pub fn set_python(program: PathBuf) {
+/// Names the Python that this process is part of, which has the command as its module in the folder `packages`: programs of
+/// Python run in it, and so do models, each in a process of its own.
+pub fn set_python(program: PathBuf, packages: PathBuf) {
     cif_capture::structure::set_python(program.clone());
     cif_vision::runtime::run_apart(move || {
-        let script = format!("import sys, cif4d; sys.argv = ['cif', '{RUN_MODEL}']; sys.exit(cif4d.main())");
-        cif_system::python::script(&program, &script)
+        // A program may have added the folder to its own search path alone.
+        let script = format!(
+            "sys.path.append(sys.argv[1]); import cif4d; sys.argv = ['cif', '{RUN_MODEL}']; sys.exit(cif4d.main())"
+        );
+        let mut command = cif_system::python::script(&program, &script);
+        command.arg(&packages);
+        command
     });
 }
 

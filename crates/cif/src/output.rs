@@ -191,7 +191,11 @@ pub fn check_folder(path: &Path, overwrite: bool) -> Result<(), Error> {
             "choose another name with -o",
         ));
     }
-    fs::create_dir_all(path).map_err(Error::io("create the folder", path))?;
+    if !path.exists() {
+        // A folder that nothing can be written into is not made either.
+        check_new_folder(path)?;
+        fs::create_dir_all(path).map_err(Error::io("create the folder", path))?;
+    }
     let mut entries = fs::read_dir(path).map_err(Error::io("read the folder", path))?;
     if entries.next().is_some() && !overwrite {
         return Err(Error::failed(
@@ -261,9 +265,11 @@ impl NewFile {
 }
 
 fn probe(folder: &Path) -> Result<(), Error> {
-    cif_output::probe(folder).map_err(|source| Error::Failed {
-        message: format!("cannot write to the folder {}: {source}", folder.display()),
-        help: Some("check its permissions and the free space, or choose another folder".to_owned()),
+    cif_output::probe(folder).map_err(|source| {
+        Error::failed(
+            format!("cannot write to the folder {}: {source}", folder.display()),
+            "check its permissions and the free space, or choose another folder",
+        )
     })
 }
 

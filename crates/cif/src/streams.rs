@@ -6,6 +6,7 @@
 
 use std::fmt::Arguments;
 use std::io::{self, ErrorKind, Write};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 use crate::error::Error;
@@ -35,10 +36,13 @@ macro_rules! eprintln {
     ($($words:tt)*) => { eprint!("{}\n", format_args!($($words)*)) };
 }
 
-/// From here on the process ends by SIGPIPE when a reader of its stdout or stderr has left, as programs do by default:
-/// for commands that do nothing but print.
+/// True where the process ends when a reader of its stdout or stderr has left.
+static ENDS: AtomicBool = AtomicBool::new(false);
+
+/// From here on the process ends by SIGPIPE when a reader of its stdout or stderr has left, as programs do by default: for
+/// commands that do nothing but print. Readers of other pipes are programs that it started itself, whose end it reports.
 pub(crate) fn end_with_reader() {
-    sigpipe::reset();
+    ENDS.store(true, Ordering::Relaxed);
 }
 
 /// Writes to stdout.
@@ -50,7 +54,9 @@ pub(crate) fn answer(words: Arguments<'_>) {
 /// Writes to stderr, whose failures reach nobody.
 pub(crate) fn message(words: Arguments<'_>) {
     // In one piece, so that lines of threads and of children do not mix.
-    let _ = io::stderr().write_all(words.to_string().as_bytes());
+    if io::stderr().write_all(words.to_string().as_bytes()).is_err_and(|error| is_reader_gone(&error)) {
+        reader_left();
+    }
 }
 
 /// Checks that all answers went out.
@@ -64,9 +70,24 @@ pub(crate) fn check() -> Result<(), Error> {
 }
 
 fn keep_failure(done: io::Result<()>) {
-    if let Err(error) = done
-        && error.kind() != ErrorKind::BrokenPipe
-    {
-        FAILURE.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+    match done {
+        Err(error) if is_reader_gone(&error) => reader_left(),
+        Err(error) => {
+            FAILURE.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+        }
+        Ok(()) => {}
+    }
+}
+
+fn is_reader_gone(error: &io::Error) -> bool {
+    error.kind() == ErrorKind::BrokenPipe
+}
+
+/// Ends a process that only prints, without what it has not finished.
+fn reader_left() {
+    if ENDS.load(Ordering::Relaxed) {
+        cif_output::abandon();
+        #[cfg(unix)]
+        let _ = signal_hook::low_level::emulate_default_handler(signal_hook::consts::SIGPIPE);
     }
 }

@@ -14,6 +14,7 @@ mod edits;
 mod gpu;
 mod hard_captures;
 mod hard_cases;
+mod module_tangles;
 mod objects;
 mod outputs;
 mod reference;

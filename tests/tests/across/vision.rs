@@ -307,6 +307,18 @@ fn a_scene_is_asked_in_words() {
     let told = cif(path, &[&question[..6], &nothing].concat()).succeeds().stdout;
     assert!(told.contains("in 0 of 1 pictures") && told.contains("no instance"), "{told}");
     assert_eq!((kept().len(), folders("elsewhere")), (17, 1));
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+
+        // Anybody may have put masks there.
+        fs::set_permissions(path.join("elsewhere"), fs::Permissions::from_mode(0o777)).unwrap();
+        fs::remove_dir_all(fs::read_dir(path.join("elsewhere")).unwrap().next().unwrap().unwrap().path())
+            .unwrap();
+        let run = cif(path, &[&question[..6], &nothing].concat()).succeeds();
+        assert!(run.stderr.contains("elsewhere: other users may write into it"), "{}", run.stderr);
+        assert_eq!(folders("elsewhere"), 0);
+    }
 
     // Where the mask of the first view lies as it is rendered.
     let red = json(

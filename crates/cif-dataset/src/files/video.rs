@@ -35,7 +35,8 @@ impl Extraction {
 /// Frames of a video as PNG files in order (`0000.png`, ...), extracted unless an earlier call did so.
 ///
 /// They lie in `.cif_frames/<stem>-<most>[-<width>x<height>]` inside `root`, or in the system's temporary folder where
-/// `root` cannot be written. `images` is where a person would put extracted frames (for the message).
+/// `root` cannot be written, or somebody else has made that folder. `images` is where a person would put extracted
+/// frames (for the message).
 ///
 /// # Errors
 /// When ffmpeg is missing or fails.
@@ -60,8 +61,9 @@ fn frames_with(
     let caches =
         [root.join(CACHE), std::env::temp_dir().join(format!("cif_frames_{:016x}", fingerprint(root)))];
     let changed = |path: &Path| std::fs::metadata(path).and_then(|data| data.modified()).ok();
-    let is_trusted = |cache: &PathBuf| *cache == caches[0] || cif_output::check_private(cache).is_ok();
-    for cache in caches.iter().filter(|cache| is_trusted(cache)) {
+    // Others may have made them, with frames of theirs.
+    let trust = [cif_output::check_of_owner(&caches[0], root), cif_output::check_private(&caches[1])];
+    for (cache, _) in caches.iter().zip(&trust).filter(|(_, trust)| trust.is_ok()) {
         let folder = cache.join(&name);
         if folder.is_dir() && changed(&folder) >= changed(video) {
             let found = numbered(&folder)?;
@@ -70,10 +72,13 @@ fn frames_with(
             }
         }
     }
-    let (cache, (scratch, partial)) = match begun(&caches[0]) {
-        Ok(begun) => (&caches[0], begun),
-        Err(_) => {
-            // Others may have made it, with frames of theirs.
+    let here = match &trust[0] {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => None,
+        _ => begun(&caches[0]).ok(),
+    };
+    let (cache, (scratch, partial)) = match here {
+        Some(begun) => (&caches[0], begun),
+        None => {
             cif_output::private_folder(&caches[1]).map_err(Error::write(&caches[1]))?;
             (&caches[1], begun(&caches[1]).map_err(Error::write(&caches[1]))?)
         }
@@ -110,7 +115,7 @@ fn frames_with(
         return Err(failed("it holds no frame"));
     }
     let folder = cache.join(&name);
-    scratch.replace(&[(partial, folder.clone())], None).map_err(Error::write(&folder))?;
+    scratch.replace(&[(partial, folder.clone())], &[]).map_err(Error::write(&folder))?;
     numbered(&folder)
 }
 
@@ -229,5 +234,9 @@ mod tests {
         // Other frames are others.
         let fewer = Extraction { most: 1, ..wanted };
         assert!(frames_with(OsStr::new("no-such-program"), root.path(), &video, &images, fewer).is_err());
+        // Anybody may have put other frames there.
+        let cache = root.path().join(CACHE);
+        std::fs::set_permissions(&cache, std::fs::Permissions::from_mode(0o777)).unwrap();
+        assert!(frames_with(OsStr::new("no-such-program"), root.path(), &video, &images, wanted).is_err());
     }
 }

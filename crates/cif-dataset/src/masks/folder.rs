@@ -40,7 +40,7 @@ impl NewFolder {
     pub fn finish(self) -> Result<(), Error> {
         let Self { scratch, partial, place } = self;
         check_free(&place)?;
-        scratch.replace(&[(partial, place.clone())], None).map_err(Error::write(&place))
+        scratch.replace(&[(partial, place.clone())], &[]).map_err(Error::write(&place))
     }
 }
 

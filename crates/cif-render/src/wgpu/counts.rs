@@ -8,7 +8,6 @@
 use super::buffers::{GpuVec, Uniform};
 use super::device::Gpu;
 use super::error::GpuError;
-use super::kernel::Access::{Read, ReadWrite, Uniform as UniformAccess};
 use super::kernel::{Commands, Kernel, Module, Snippet, structures, workgroups};
 use super::layout::Shared;
 use super::rasterizer::Rasterizer;
@@ -42,7 +41,6 @@ pub const COUNT_LABELS: Module = Module {
     name: "count_labels",
     text: include_str!("count_labels.wgsl"),
     imports: &[CONSTANTS, VIEW, SPLAT, LABEL_CHUNK],
-    bindings: &[UniformAccess, UniformAccess, Read, Read, Read, Read, Read, ReadWrite],
     entries: &["count_labels"],
 };
 
@@ -51,7 +49,6 @@ pub const GATHER_COUNTS: Module = Module {
     name: "gather_counts",
     text: include_str!("gather_counts.wgsl"),
     imports: &[CONSTANTS, NUMBERS, VIEW, SPLAT, LABEL_CHUNK],
-    bindings: &[UniformAccess, UniformAccess, Read, Read, Read, Read, Read, ReadWrite],
     entries: &["gather_counts"],
 };
 

@@ -5,8 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use super::error::GpuError;
 use super::features::GpuFeatures;
-use super::kernel::Kernel;
-use super::workgroup::{Form, SubgroupUse, self_check};
+use super::form::{Form, SubgroupUse};
 
 /// Interfaces that are asked for GPUs. OpenGL is left out: its drivers are listed twice where Vulkan is there, and
 /// compute is optional in it.
@@ -112,8 +111,19 @@ fn missing(limits: &wgpu::Limits) -> Vec<String> {
 /// The first fault that the driver told, kept until someone asks.
 type Fault = Arc<Mutex<Option<GpuError>>>;
 
-/// Kernels by the name and the source of their module.
-type Compiled = Arc<Mutex<BTreeMap<(&'static str, String), Vec<Kernel>>>>;
+/// A module that the driver has compiled.
+#[derive(Clone, Debug)]
+pub(super) struct CompiledModule {
+    /// Of its bindings.
+    pub(super) layout: wgpu::BindGroupLayout,
+    /// Number of its bindings.
+    pub(super) bindings: usize,
+    /// Of its entry points.
+    pub(super) pipelines: Vec<wgpu::ComputePipeline>,
+}
+
+/// What was compiled, by the name and the source of the module.
+type Compiled = Arc<Mutex<BTreeMap<(&'static str, String), CompiledModule>>>;
 
 /// A device with its queue and what was compiled for it. Clones share all.
 #[derive(Clone, Debug)]
@@ -134,21 +144,8 @@ impl Gpu {
         adapters().iter().map(AdapterFacts::of).collect()
     }
 
-    /// Opens the best adapter: discrete before integrated before virtual before software. The environment variable
-    /// `WGPU_ADAPTER_NAME` restricts the choice to adapters whose name contains it, and `CIF_GPU_FEATURES` what is
-    /// used of them, see [`GpuFeatures::from_environment`].
-    ///
-    /// # Errors
-    /// When there is none, when it is below the core limits of WebGPU, or when the driver refuses.
-    pub fn open() -> Result<Self, GpuError> {
-        Self::open_with(GpuFeatures::from_environment()?)
-    }
-
-    /// As [`Self::open`], using what `features` allow and the adapter has.
-    ///
-    /// # Errors
-    /// As [`Self::open`].
-    pub fn open_with(features: GpuFeatures) -> Result<Self, GpuError> {
+    /// As [`Self::open_with`], with subgroups that have not been checked.
+    pub(super) fn unchecked(features: GpuFeatures) -> Result<Self, GpuError> {
         let wanted = std::env::var("WGPU_ADAPTER_NAME").unwrap_or_default();
         let all = adapters();
         let names: Vec<String> = all.iter().map(|adapter| adapter.get_info().name).collect();
@@ -231,43 +228,30 @@ impl Gpu {
         };
         let (facts, subgroups) = (Arc::new(facts), Arc::new(subgroups));
         let kernels = Compiled::default();
-        Self { device, queue, facts, subgroups, constants_in_storage, fault, kernels }.checked()
+        Ok(Self { device, queue, facts, subgroups, constants_in_storage, fault, kernels })
     }
 
-    /// Kernels of a module's source: those compiled before, or else what `compile` makes of it.
+    /// A module by its source: as it was compiled before, or else what `compile` makes of it.
     pub(super) fn compiled(
         &self,
         module: &'static str,
         source: String,
-        compile: impl FnOnce(&str) -> Result<Vec<Kernel>, GpuError>,
-    ) -> Result<Vec<Kernel>, GpuError> {
-        let compiled = || self.kernels.lock().unwrap_or_else(PoisonError::into_inner);
+        compile: impl FnOnce(&str) -> Result<CompiledModule, GpuError>,
+    ) -> Result<CompiledModule, GpuError> {
+        let known = || self.kernels.lock().unwrap_or_else(PoisonError::into_inner);
         let key = (module, source);
-        if let Some(kernels) = compiled().get(&key) {
-            return Ok(kernels.clone());
+        if let Some(module) = known().get(&key) {
+            return Ok(module.clone());
         }
-        let kernels = compile(&key.1)?;
-        compiled().insert(key, kernels.clone());
-        Ok(kernels)
+        let module = compile(&key.1)?;
+        known().insert(key, module.clone());
+        Ok(module)
     }
 
-    /// Itself with subgroups that are used only where they compute known numbers right.
-    fn checked(self) -> Result<Self, GpuError> {
-        if self.form() == Form::Portable {
-            return Ok(self);
-        }
-        let wrong = match self_check(&self) {
-            Ok(wrong) => wrong,
-            Err(error @ (GpuError::OutOfMemory(_) | GpuError::Lost(_))) => return Err(error),
-            Err(error) => Some(error.to_string()),
-        };
-        Ok(match wrong {
-            None => self,
-            Some(what) => {
-                *self.fault.lock().unwrap_or_else(PoisonError::into_inner) = None;
-                Self { subgroups: Arc::new(SubgroupUse::Wrong(what)), ..self }
-            }
-        })
+    /// The same without subgroups, for what came out wrong with them; the faults of that are forgotten.
+    pub(super) fn without_subgroups(self, wrong: String) -> Self {
+        *self.fault.lock().unwrap_or_else(PoisonError::into_inner) = None;
+        Self { subgroups: Arc::new(SubgroupUse::Wrong(wrong)), ..self }
     }
 
     /// Use of subgroups by kernels, or the reason why they are not used.

@@ -1,8 +1,8 @@
 //! Compute kernels from embedded WGSL files.
 //!
-//! A [`Module`] is one WGSL file with what it imports and the bindings it declares, in order. Line by line,
-//! `#import name` is replaced by the snippet of that name, once; snippets may import others. `#paste name` is
-//! replaced each time. Constants and structures that Rust knows are snippets made by [`constants`] and
+//! A [`Module`] is one WGSL file with the snippets that it imports and its entry points; bindings are those that the
+//! file declares, see [`super::reflection`]. Line by line, `#import name` is replaced by the snippet of that name, once;
+//! snippets may import others. `#paste name` is replaced each time. Constants and structures that Rust knows are snippets made by [`constants`] and
 //! [`structures`], so that nothing is typed twice; what exists in two forms is chosen for the device, see
 //! [`super::workgroup`].
 //!
@@ -10,30 +10,12 @@
 //! that are timed on the device where it has timestamps.
 
 use super::buffers::GpuVec;
-use super::device::Gpu;
+use super::device::{CompiledModule, Gpu};
 use super::error::GpuError;
+use super::form::Form;
 use super::layout::Layout;
-use super::workgroup::Form;
-
-/// Text that modules import.
-#[derive(Clone, Copy, Debug)]
-pub struct Snippet {
-    /// Name after `#import`.
-    pub name: &'static str,
-    /// Makes the text.
-    pub text: fn() -> String,
-}
-
-/// Address space and access mode of a binding.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Access {
-    /// `var<uniform>`.
-    Uniform,
-    /// `var<storage, read>`.
-    Read,
-    /// `var<storage, read_write>`.
-    ReadWrite,
-}
+use super::reflection::{Access, Reflection};
+pub use super::snippet::Snippet;
 
 /// A WGSL file.
 #[derive(Clone, Copy, Debug)]
@@ -44,8 +26,6 @@ pub struct Module {
     pub text: &'static str,
     /// Snippets that the file may import.
     pub imports: &'static [Snippet],
-    /// Bindings of group 0, in order.
-    pub bindings: &'static [Access],
     /// Entry points.
     pub entries: &'static [&'static str],
 }
@@ -148,29 +128,36 @@ impl Kernel {
         if gpu.constants_in_storage() {
             source = source.replace("var<uniform>", "var<storage, read>");
         }
-        gpu.compiled(module.name, source, |source| Self::compile_source(gpu, module, source))
+        let compiled =
+            gpu.compiled(module.name, source, |source| Self::compile_source(gpu, module, source))?;
+        let CompiledModule { layout, bindings, pipelines } = compiled;
+        let kernel = |(entry, pipeline)| Self {
+            label: format!("{}.{entry}", module.name),
+            pipeline,
+            layout: layout.clone(),
+            bindings,
+        };
+        Ok(module.entries.iter().zip(pipelines).map(kernel).collect())
     }
 
-    fn compile_source(gpu: &Gpu, module: &Module, source: &str) -> Result<Vec<Self>, GpuError> {
+    fn compile_source(gpu: &Gpu, module: &Module, source: &str) -> Result<CompiledModule, GpuError> {
+        let rejected = |error: String| GpuError::Rejected(format!("{}.wgsl: {error}", module.name));
+        let reflection = Reflection::of_source(source).map_err(rejected)?;
         let device = gpu.device();
         let scope = device.push_error_scope(wgpu::ErrorFilter::Validation);
         let shader = device.create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(module.name),
             source: wgpu::ShaderSource::Wgsl(source.into()),
         });
-        let entries: Vec<wgpu::BindGroupLayoutEntry> = module
-            .bindings
-            .iter()
-            .enumerate()
+        let entries: Vec<wgpu::BindGroupLayoutEntry> = (0_u32..)
+            .zip(&reflection.bindings)
             .map(|(binding, access)| wgpu::BindGroupLayoutEntry {
-                binding: binding as u32,
+                binding,
                 visibility: wgpu::ShaderStages::COMPUTE,
                 ty: wgpu::BindingType::Buffer {
                     ty: match access {
-                        Access::Uniform if !gpu.constants_in_storage() => wgpu::BufferBindingType::Uniform,
-                        Access::Uniform | Access::Read => {
-                            wgpu::BufferBindingType::Storage { read_only: true }
-                        }
+                        Access::Uniform => wgpu::BufferBindingType::Uniform,
+                        Access::Read => wgpu::BufferBindingType::Storage { read_only: true },
                         Access::ReadWrite => wgpu::BufferBindingType::Storage { read_only: false },
                     },
                     has_dynamic_offset: false,
@@ -188,11 +175,11 @@ impl Kernel {
             bind_group_layouts: &[Some(&layout)],
             immediate_size: 0,
         });
-        let kernels = module
+        let pipelines = module
             .entries
             .iter()
             .map(|entry| {
-                let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+                device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
                     label: Some(entry),
                     layout: Some(&pipeline_layout),
                     module: &shader,
@@ -203,18 +190,16 @@ impl Kernel {
                         ..Default::default()
                     },
                     cache: None,
-                });
-                Self {
-                    label: format!("{}.{entry}", module.name),
-                    pipeline,
-                    layout: layout.clone(),
-                    bindings: module.bindings.len(),
-                }
+                })
             })
             .collect();
         match pollster::block_on(scope.pop()) {
-            Some(error) => Err(GpuError::Rejected(format!("{}.wgsl: {error}", module.name))),
-            None => gpu.check().map(|()| kernels),
+            Some(error) => Err(rejected(error.to_string())),
+            None => gpu.check().map(|()| CompiledModule {
+                layout,
+                bindings: reflection.bindings.len(),
+                pipelines,
+            }),
         }
     }
 
@@ -450,7 +435,6 @@ mod tests {
             name: "test",
             text: "#import b\n#import a\n#import a\nfn f() {}\n#paste b\n#paste b",
             imports: &[A, B],
-            bindings: &[],
             entries: &[],
         };
         let expected = "const B = 1;\nconst A = B;\nfn f() {}\nconst B = 1;\nconst B = 1;\n";
@@ -487,7 +471,6 @@ mod tests {
                 fn run(@builtin(global_invocation_id) id: vec3u) {\n\
                 if (id.x < arrayLength(&values)) { values[id.x] *= factor.x; } }",
             imports: &[],
-            bindings: &[Access::Uniform, Access::ReadWrite],
             entries: &["run"],
         };
         let kernel = Kernel::compile(&gpu, &DOUBLE).unwrap().remove(0);
@@ -532,8 +515,7 @@ mod tests {
         let text = "@group(0) @binding(0) var<storage, read_write> values: array<u32>;\n\
             @compute @workgroup_size(64)\n\
             fn run(@builtin(global_invocation_id) id: vec3u) { values[id.x] = STEP; }";
-        let module =
-            Module { name: "step", text, imports: &[], bindings: &[Access::ReadWrite], entries: &["run"] };
+        let module = Module { name: "step", text, imports: &[], entries: &["run"] };
         let compiled = |gpu: &Gpu, step: u32| {
             let declarations = constants(&[("STEP", Constant::Unsigned(step))]);
             Kernel::compile_with(gpu, &module, &declarations).unwrap().remove(0).pipeline
@@ -546,8 +528,7 @@ mod tests {
     #[test]
     fn a_kernel_that_the_driver_rejects_is_an_error_that_names_the_file() {
         let Some(gpu) = crate::wgpu::testing::gpu() else { return };
-        let module =
-            Module { name: "broken", text: "fn f( {", imports: &[], bindings: &[], entries: &["run"] };
+        let module = Module { name: "broken", text: "fn f( {", imports: &[], entries: &["run"] };
         let error = Kernel::compile(&gpu, &module).unwrap_err();
         assert!(error.to_string().contains("broken.wgsl"), "{error}");
         gpu.check().expect("the fault was handled where it arose");

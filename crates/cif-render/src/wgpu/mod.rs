@@ -4,8 +4,11 @@
 //! |---|---|
 //! | [`device`] | which GPU, what it can do, what went wrong on it |
 //! | [`features`] | optional features, and holding them back |
-//! | [`workgroup`] | what invocations do together, through workgroup memory or by subgroups |
+//! | [`form`] | what invocations do together, through workgroup memory or by subgroups |
+//! | [`workgroup`] | the check of subgroups, by which devices are opened |
+//! | [`snippet`] | text that WGSL files import |
 //! | [`kernel`] | kernels from WGSL files, recorded commands, times on the device |
+//! | [`reflection`] | bindings and entry points of WGSL, as naga finds them |
 //! | [`gaussians`], [`identities`] | Gaussians and their gradients, and identities, on the device |
 //! | [`faults`] | what no optimiser may take |
 //! | [`counts`] | label mass of Gaussians |
@@ -18,6 +21,7 @@
 //! | [`validation`] | checks of WGSL files without a GPU |
 //! | [`error`] | what can go wrong |
 //! | [`view`] | the view, splats, constants: what all stages share |
+//! | [`table`] | the stages, a row each, with their versions and tests |
 //! | [`stages`] | the WGSL files of rendering |
 //! | [`sort`] | prefix sums and radix sorts |
 //! | [`rasterizer`] | the stages in order, in both directions |
@@ -36,23 +40,26 @@ pub mod device;
 pub mod error;
 pub mod faults;
 pub mod features;
+pub mod form;
 pub mod gaussians;
 pub mod identities;
 pub mod kernel;
 pub mod layout;
 pub mod poses;
 pub mod rasterizer;
+pub mod reflection;
 pub mod renderer;
+pub mod snippet;
 pub mod sort;
 pub mod speed;
 pub mod stages;
+pub mod table;
 pub mod testing;
 pub mod validation;
 pub mod view;
 pub mod workgroup;
 
 pub use ::wgpu::{BindGroup, SubmissionIndex as Submission};
-pub use blend::BlendWeightGradients;
 pub use buffers::{Arriving, GpuVec, PendingWords, Readback, Recorded, Uniform};
 pub use cache::{BindCache, Place, UniformCache};
 pub use counts::GpuIdentityCounts;
@@ -60,54 +67,23 @@ pub use deform::{DeformationGradients, GpuDeformation};
 pub use device::{AdapterFacts, Gpu};
 pub use error::GpuError;
 pub use features::GpuFeatures;
+pub use form::{Form, SubgroupUse};
 pub use gaussians::GpuGaussians;
 pub use identities::{DeviceIdentities, packed_entries};
 pub use kernel::{
-    Access, Commands, Constant, Kernel, MAX_WORKGROUPS, Module, Snippet, Stage, Timestamps, constants,
-    structures, workgroups,
+    Commands, Constant, Kernel, MAX_WORKGROUPS, Module, Snippet, Stage, Timestamps, constants, structures,
+    workgroups,
 };
 pub use layout::{Layout, Member, Shared, WgslType};
 pub use poses::GpuPoses;
-pub use rasterizer::{GpuStatistics, LabelInput, PosedGradients, PosedInput, Rasterizer, ViewInput};
+pub use rasterizer::{
+    BlendWeightGradients, GpuStatistics, LabelInput, PosedGradients, PosedInput, Rasterizer, ViewInput,
+};
+pub use reflection::{Access, Reflection};
 pub use renderer::GpuRenderer;
 pub use sort::{Count, RadixSort, Scan, SortArrays};
 pub use speed::DeviceSpeed;
 pub use view::{Splat, View};
-pub use workgroup::{Form, SubgroupUse};
-
-/// Every WGSL file of this crate, for the test that validates them.
-pub const MODULES: &[&Module] = &[
-    &stages::PROJECT,
-    &stages::PROJECT_PACKED,
-    &stages::PROJECT_TURNED,
-    &stages::SCAN,
-    &stages::SORT,
-    &stages::BIN,
-    &stages::EMIT,
-    &stages::RANGES,
-    &stages::RASTERIZE,
-    &stages::RASTERIZE_COLOR,
-    &stages::DENSE,
-    &stages::COTANGENTS,
-    &stages::RASTERIZE_BACKWARD,
-    &stages::RASTERIZE_BACKWARD_COLOR,
-    &stages::GATHER_GRADIENTS,
-    &stages::IDENTITY_BACKWARD,
-    &stages::PROJECT_BACKWARD,
-    &stages::PROJECT_BACKWARD_TURNED,
-    &blend::BLEND,
-    &blend::BLEND_BACKWARD,
-    &blend::BLEND_BACKWARD_WEIGHTS,
-    &blend::GATHER_VALUES,
-    &blend::GATHER_VALUES_WEIGHTS,
-    &counts::COUNT_LABELS,
-    &counts::GATHER_COUNTS,
-    &poses::POSES,
-    &poses::POSES_BACKWARD,
-    &poses::POSES_SUM,
-    &workgroup::SELF_CHECK,
-    &speed::SPEED,
-];
 
 /// Every structure that Rust and WGSL share.
 pub const LAYOUTS: &[fn() -> Layout] = &[

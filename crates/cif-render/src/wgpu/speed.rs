@@ -6,7 +6,7 @@ use super::buffers::GpuVec;
 use super::device::Gpu;
 use super::error::GpuError;
 use super::kernel::{
-    Access, Commands, Constant, Kernel, MAX_WORKGROUPS, Module, Snippet, Timestamps, constants, workgroups,
+    Commands, Constant, Kernel, MAX_WORKGROUPS, Module, Snippet, Timestamps, constants, workgroups,
 };
 use super::stages::entries;
 
@@ -36,7 +36,6 @@ pub const SPEED: Module = Module {
             ])
         },
     }],
-    bindings: &[Access::Read, Access::ReadWrite],
     entries: &["copy_values", "multiply_add"],
 };
 

@@ -1,8 +1,7 @@
-//! The WGSL files of rendering: their bindings and entry points, and the kernels made of them.
+//! The WGSL files of rendering: their imports and entry points, and the kernels made of them.
 
 use super::device::Gpu;
 use super::error::GpuError;
-use super::kernel::Access::{Read, ReadWrite, Uniform};
 use super::kernel::{Kernel, Module};
 use super::view::{
     COEFFICIENTS, COLOR_ONLY, CONSTANTS, DIRECTIONS, FOOTPRINT, HARMONICS, IDENTITY, NUMBERS,
@@ -16,7 +15,6 @@ pub const PROJECT: Module = Module {
     name: "project",
     text: include_str!("project.wgsl"),
     imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT, COEFFICIENTS, DIRECTIONS],
-    bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite],
     entries: &["project"],
 };
 
@@ -27,18 +25,14 @@ pub const PROJECT_PACKED: Module = Module {
 };
 
 /// Projection of Gaussians whose spherical harmonics are in frames of groups.
-pub const PROJECT_TURNED: Module = Module {
-    imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT, COEFFICIENTS, TURNS],
-    bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite, Read],
-    ..PROJECT
-};
+pub const PROJECT_TURNED: Module =
+    Module { imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT, COEFFICIENTS, TURNS], ..PROJECT };
 
 /// Prefix sum.
 pub const SCAN: Module = Module {
     name: "scan",
     text: include_str!("scan.wgsl"),
     imports: &[CONSTANTS, NUMBERS, SCAN_PARAMETERS],
-    bindings: &[Uniform, Read, ReadWrite, ReadWrite],
     entries: &["reduce", "spine", "spread"],
 };
 
@@ -47,7 +41,6 @@ pub const SORT: Module = Module {
     name: "sort",
     text: include_str!("sort.wgsl"),
     imports: &[CONSTANTS, NUMBERS, SORT_PARAMETERS],
-    bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
     entries: &["histogram", "scatter"],
 };
 
@@ -56,7 +49,6 @@ pub const BIN: Module = Module {
     name: "bin",
     text: include_str!("bin.wgsl"),
     imports: &[CONSTANTS, NUMBERS, VIEW, SPLAT, TILES],
-    bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
     entries: &["count", "gather", "plan"],
 };
 
@@ -65,7 +57,6 @@ pub const EMIT: Module = Module {
     name: "emit",
     text: include_str!("emit.wgsl"),
     imports: &[CONSTANTS, NUMBERS, VIEW, SPLAT, TILES],
-    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
     entries: &["emit"],
 };
 
@@ -74,7 +65,6 @@ pub const RANGES: Module = Module {
     name: "ranges",
     text: include_str!("ranges.wgsl"),
     imports: &[CONSTANTS, NUMBERS, VIEW],
-    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite],
     entries: &["ranges"],
 };
 
@@ -83,7 +73,6 @@ pub const RASTERIZE: Module = Module {
     name: "rasterize",
     text: include_str!("rasterize.wgsl"),
     imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, TILE_STAGING, TILE_FORWARD, IDENTITY],
-    bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
     entries: &["rasterize"],
 };
 
@@ -98,7 +87,6 @@ pub const DENSE: Module = Module {
     name: "dense",
     text: include_str!("dense.wgsl"),
     imports: &[CONSTANTS, VIEW, SPLAT],
-    bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
     entries: &["dense"],
 };
 
@@ -107,7 +95,6 @@ pub const COTANGENTS: Module = Module {
     name: "cotangents",
     text: include_str!("cotangents.wgsl"),
     imports: &[CONSTANTS, NUMBERS, VIEW],
-    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite],
     entries: &["cotangents_of_pixels"],
 };
 
@@ -116,7 +103,6 @@ pub const RASTERIZE_BACKWARD: Module = Module {
     name: "rasterize_backward",
     text: include_str!("rasterize_backward.wgsl"),
     imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, TILE_STAGING, TILE_BACKWARD, IDENTITY, PARTIAL_SUMS],
-    bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
     entries: &["rasterize_backward"],
 };
 
@@ -131,7 +117,6 @@ pub const GATHER_GRADIENTS: Module = Module {
     name: "gather_gradients",
     text: include_str!("gather_gradients.wgsl"),
     imports: &[CONSTANTS, NUMBERS, VIEW, SPLAT],
-    bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite],
     entries: &["gather_gradients"],
 };
 
@@ -140,7 +125,6 @@ pub const IDENTITY_BACKWARD: Module = Module {
     name: "identity_backward",
     text: include_str!("identity_backward.wgsl"),
     imports: &[CONSTANTS, NUMBERS, VIEW],
-    bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite],
     entries: &["identity_backward"],
 };
 
@@ -149,14 +133,12 @@ pub const PROJECT_BACKWARD: Module = Module {
     name: "project_backward",
     text: include_str!("project_backward.wgsl"),
     imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT, SPLAT_GRADIENTS, DIRECTIONS],
-    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
     entries: &["project_backward"],
 };
 
 /// Gradients of Gaussians whose spherical harmonics are in frames of groups.
 pub const PROJECT_BACKWARD_TURNED: Module = Module {
     imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT, TORQUES, TURNED_DIRECTIONS],
-    bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read],
     ..PROJECT_BACKWARD
 };
 

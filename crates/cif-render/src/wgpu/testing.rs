@@ -2,7 +2,7 @@
 
 use super::device::Gpu;
 use super::features::GpuFeatures;
-use super::workgroup::Form;
+use super::form::Form;
 
 /// The GPU for a test, or `None` with the reason on stderr. `off` skips, `auto` (the default) takes what is there,
 /// software rasterisers too, and `require` insists.

@@ -5,12 +5,13 @@ use std::fmt::Write as _;
 
 use naga::back::{hlsl, msl};
 use naga::valid::{Capabilities, ModuleInfo, ShaderStages, SubgroupOperationSet, ValidationFlags, Validator};
-use naga::{AddressSpace, StorageAccess, TypeInner};
+use naga::{AddressSpace, TypeInner};
 
 use super::device::MOST_UNIFORM_BLOCKS;
-use super::kernel::{Access, Module};
+use super::form::Form;
+use super::kernel::Module;
 use super::layout::Layout;
-use super::workgroup::Form;
+use super::reflection::{Access, Reflection};
 
 /// Storage buffers of an entry point in the core of WebGPU.
 const MAX_STORAGE_BUFFERS: usize = 8;
@@ -20,7 +21,7 @@ const MAX_WORKGROUP_BYTES: u32 = 16_384;
 const MAX_INVOCATIONS: u32 = 256;
 
 /// Checks that a module is valid WGSL, without any optional feature and in the form with subgroups, that its bindings
-/// and entry points are the listed ones, that structures lie as in Rust, that every entry point keeps to the core
+/// make a layout, that its entry points are the listed ones, that structures lie as in Rust, that every entry point keeps to the core
 /// limits of WebGPU, and that Metal and Direct3D can be given it.
 ///
 /// # Errors
@@ -63,32 +64,13 @@ fn validate_in(form: Form, module: &Module, declarations: &str, layouts: &[Layou
         let _ = writeln!(wrong, "{}.wgsl: {what}", module.name);
     };
 
-    for (index, access) in module.bindings.iter().enumerate() {
-        let declared = parsed.global_variables.iter().find(|(_, variable)| {
-            variable.binding.as_ref().is_some_and(|b| b.group == 0 && b.binding == index as u32)
-        });
-        let found = declared.and_then(|(_, variable)| match variable.space {
-            AddressSpace::Uniform => Some(Access::Uniform),
-            AddressSpace::Storage { access } if access.contains(StorageAccess::STORE) => {
-                Some(Access::ReadWrite)
-            }
-            AddressSpace::Storage { .. } => Some(Access::Read),
-            _ => None,
-        });
-        if found != Some(*access) {
-            complain(format!("binding {index} is {found:?}, Rust binds {access:?}"));
-        }
-    }
-    let blocks = module.bindings.iter().filter(|access| **access == Access::Uniform).count();
+    let Reflection { bindings, entries } = match Reflection::of_module(&parsed) {
+        Ok(reflection) => reflection,
+        Err(error) => return Err(format!("{}.wgsl: {error}\n", module.name)),
+    };
+    let blocks = bindings.iter().filter(|access| **access == Access::Uniform).count();
     if blocks > MOST_UNIFORM_BLOCKS as usize {
         complain(format!("{blocks} uniform blocks, where software has room for {MOST_UNIFORM_BLOCKS}"));
-    }
-    for (_, variable) in parsed.global_variables.iter() {
-        if let Some(binding) = &variable.binding
-            && (binding.group != 0 || binding.binding as usize >= module.bindings.len())
-        {
-            complain(format!("{:?} is bound at {binding:?}, which Rust does not know", variable.name));
-        }
     }
 
     for (_, ty) in parsed.types.iter() {
@@ -108,7 +90,6 @@ fn validate_in(form: Form, module: &Module, declarations: &str, layouts: &[Layou
         }
     }
 
-    let entries: Vec<&str> = parsed.entry_points.iter().map(|entry| entry.name.as_str()).collect();
     if entries != module.entries {
         complain(format!("entry points are {entries:?}, Rust knows {:?}", module.entries));
     }
@@ -134,7 +115,7 @@ fn validate_in(form: Form, module: &Module, declarations: &str, layouts: &[Layou
             }
         }
         // The layout of a module binds all its buffers, whichever an entry point uses.
-        let bound = module.bindings.iter().filter(|access| **access != Access::Uniform).count();
+        let bound = bindings.iter().filter(|access| **access != Access::Uniform).count();
         if storage.max(bound) > MAX_STORAGE_BUFFERS {
             complain(format!("{} binds {} storage buffers", entry.name, storage.max(bound)));
         }
@@ -181,7 +162,7 @@ fn to_hlsl(form: Form, parsed: &naga::Module, information: &ModuleInfo) -> Resul
 mod tests {
     use super::*;
     use crate::wgpu::layout::Shared;
-    use crate::wgpu::{LAYOUTS, MODULES, structures};
+    use crate::wgpu::{LAYOUTS, deform, structures, table};
 
     crate::shared_struct! {
         /// A scalar, a vector that needs alignment, and an array.
@@ -204,16 +185,18 @@ mod tests {
         name: "probe",
         text: GOOD,
         imports: &[crate::wgpu::Snippet { name: "probe", text: || structures(&[Probe::layout()]) }],
-        bindings: &[Access::Uniform, Access::ReadWrite],
         entries: &["run"],
     };
 
     #[test]
     fn every_module_is_valid_and_lies_as_in_rust() {
         let layouts: Vec<Layout> = LAYOUTS.iter().map(|layout| layout()).collect();
-        let wrong: String = MODULES.iter().filter_map(|module| validate(module, &layouts).err()).collect();
+        // Those of the deformation need the constants of one, and have a test of their own.
+        let of_deformation = |module: &Module| deform::MODULES.iter().any(|other| other.name == module.name);
+        let modules = || table::modules().filter(|module| !of_deformation(module));
+        let wrong: String = modules().filter_map(|module| validate(module, &layouts).err()).collect();
         assert!(wrong.is_empty(), "{wrong}");
-        for module in MODULES {
+        for module in modules() {
             assert!(
                 module.text.starts_with("// "),
                 "{}.wgsl opens with a paragraph on what it does and names its Rust twin",
@@ -235,8 +218,8 @@ mod tests {
         };
         let layout = [Probe::layout()];
         fails(Module { text: "fn f( {}", ..PROBE }, &layout, "probe.wgsl");
-        fails(Module { bindings: &[Access::Uniform, Access::Read], ..PROBE }, &layout, "binding 1");
-        fails(Module { bindings: &[Access::Uniform], ..PROBE }, &layout, "does not know");
+        let gap = GOOD.replace("@binding(1)", "@binding(2)");
+        fails(Module { text: Box::leak(gap.into_boxed_str()), ..PROBE }, &layout, "expected binding 1");
         fails(Module { entries: &["walk"], ..PROBE }, &layout, "entry points");
         let mut moved = Probe::layout();
         moved.members[2].offset += 4;

@@ -1,93 +1,46 @@
-//! Cooperation of the invocations of a workgroup, in two forms of one interface: through workgroup memory, which
-//! every device has, and by subgroups. A module imports `workgroup`, pastes `lane_builtins` into the parameters of
-//! its entry points and `lane` at their start; which form it gets is the device's. Drivers are not taken at their
-//! word: a device uses subgroups only after known numbers have come out right.
+//! The check of subgroups. Drivers are not taken at their word: a device uses subgroups only after known numbers have
+//! come out right.
 
 use super::buffers::GpuVec;
 use super::device::Gpu;
 use super::error::GpuError;
-use super::kernel::{Access, Commands, Kernel, Module, Snippet};
+use super::features::GpuFeatures;
+use super::form::Form;
+use super::kernel::{Commands, Kernel, Module};
 
-/// Means by which the invocations of a workgroup cooperate.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Form {
-    /// Through workgroup memory.
-    #[default]
-    Portable,
-    /// By subgroups.
-    Subgroups,
-}
-
-impl Form {
-    /// Both.
-    pub const ALL: [Self; 2] = [Self::Portable, Self::Subgroups];
-
-    /// Snippets that modules import as `workgroup`, `lane_builtins` and `lane`.
+impl Gpu {
+    /// Opens the best adapter: discrete before integrated before virtual before software. The environment variable
+    /// `WGPU_ADAPTER_NAME` restricts the choice to adapters whose name contains it, and `CIF_GPU_FEATURES` what is
+    /// used of them, see [`GpuFeatures::from_environment`].
     ///
-    /// Subgroup built-ins are parameters and no members of a structure, for naga 30 misses those in HLSL; and it
-    /// takes no `enable subgroups;`.
-    #[must_use]
-    pub fn snippets(self) -> &'static [Snippet; 3] {
-        match self {
-            Self::Portable => &[
-                Snippet { name: "workgroup", text: || include_str!("shared/workgroup.wgsl").to_owned() },
-                Snippet {
-                    name: "lane_builtins",
-                    text: || "@builtin(local_invocation_index) local: u32,".to_owned(),
-                },
-                Snippet { name: "lane", text: || "let lane = Lane(local);".to_owned() },
-            ],
-            Self::Subgroups => &[
-                Snippet {
-                    name: "workgroup",
-                    text: || include_str!("shared/workgroup_by_subgroups.wgsl").to_owned(),
-                },
-                Snippet {
-                    name: "lane_builtins",
-                    text: || {
-                        "@builtin(local_invocation_index) local: u32,\n\
-                         @builtin(subgroup_id) subgroup: u32,\n\
-                         @builtin(num_subgroups) subgroups: u32,"
-                            .to_owned()
-                    },
-                },
-                Snippet {
-                    name: "lane",
-                    text: || {
-                        "let lane = Lane(local, subgroup, subgroups, subgroupExclusiveAdd(1u));".to_owned()
-                    },
-                },
-            ],
-        }
+    /// # Errors
+    /// When there is none, when it is below the core limits of WebGPU, or when the driver refuses.
+    pub fn open() -> Result<Self, GpuError> {
+        Self::open_with(GpuFeatures::from_environment()?)
     }
-}
 
-/// Use of subgroups on a device, or the reason against it.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum SubgroupUse {
-    /// It does, and known numbers came out right.
-    Used,
-    /// The adapter has none.
-    Missing,
-    /// `CIF_GPU_FEATURES` does not name them.
-    HeldBack,
-    /// Software stands in for a GPU, and loops over them.
-    Software,
-    /// Known numbers came out wrong: what did.
-    Wrong(String),
-}
+    /// As [`Self::open`], using what `features` allow and the adapter has.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn open_with(features: GpuFeatures) -> Result<Self, GpuError> {
+        Self::unchecked(features)?.checked()
+    }
 
-impl std::fmt::Display for SubgroupUse {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Used => f.write_str("used for sums over workgroups, after known numbers came out right"),
-            Self::Missing => f.write_str("not there, sums go through workgroup memory"),
-            Self::HeldBack => f.write_str("not used, as CIF_GPU_FEATURES says"),
-            Self::Software => f.write_str(
-                "not used, because software loops over them (CIF_GPU_FEATURES=all uses them all the same)",
-            ),
-            Self::Wrong(what) => write!(f, "not used, because this driver does not get them right: {what}"),
+    /// Itself with subgroups that are used only where they compute known numbers right.
+    fn checked(self) -> Result<Self, GpuError> {
+        if self.form() == Form::Portable {
+            return Ok(self);
         }
+        let wrong = match self_check(&self) {
+            Ok(wrong) => wrong,
+            Err(error @ (GpuError::OutOfMemory(_) | GpuError::Lost(_))) => return Err(error),
+            Err(error) => Some(error.to_string()),
+        };
+        Ok(match wrong {
+            None => self,
+            Some(what) => self.without_subgroups(what),
+        })
     }
 }
 
@@ -96,7 +49,6 @@ pub const SELF_CHECK: Module = Module {
     name: "self_check",
     text: include_str!("self_check.wgsl"),
     imports: &[],
-    bindings: &[Access::ReadWrite],
     entries: &["self_check"],
 };
 

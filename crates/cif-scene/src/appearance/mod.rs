@@ -9,12 +9,12 @@ pub(crate) mod blur;
 pub(crate) mod visibility;
 
 use cif_field::gaussians::SH_FLOATS;
+use cif_geometry::scalar::direct_sigmoid;
 use cif_geometry::spherical_harmonics::{HarmonicsRotation, coefficient_count};
 use glam::DQuat;
 use rayon::prelude::*;
 
-use crate::build::frames::Frames;
-use crate::build::sigmoid;
+use crate::from_field::frames::Frames;
 use crate::graph::{Appearance, AppearanceSample, Motion, is_visible_at, pose_at};
 use crate::motion::keys;
 use crate::{Node, VisibilitySample};
@@ -46,7 +46,7 @@ impl Opacities {
                 }
             }
         }
-        Self { peak: peak.into_iter().map(sigmoid).collect(), change }
+        Self { peak: peak.into_iter().map(direct_sigmoid).collect(), change }
     }
 }
 
@@ -71,7 +71,7 @@ pub(crate) fn fade(node: &mut Node, frames: &mut Frames<'_>, min_opacity: f32, t
         .map(|(step, &time_code)| {
             let frame = frames.at(step);
             let rows = &node.splats.rows;
-            let values = rows.iter().map(|&row| sigmoid(frame.opacity_logits[row as usize])).collect();
+            let values = rows.iter().map(|&row| direct_sigmoid(frame.opacity_logits[row as usize])).collect();
             AppearanceSample { time_code, values }
         })
         .collect();
@@ -115,9 +115,8 @@ pub(crate) fn recolor(node: &mut Node, frames: &mut Frames<'_>, thinning: &Thinn
             let frame = frames.at(step);
             let mut values = vec![0.0; floats * node.splats.len()];
             for (range, rotation) in turns(node, time_code) {
-                let back = (rotation.xyz().length() > 1e-9).then(|| {
-                    HarmonicsRotation::<f32>::new(crate::field_from_graph::rows_of(rotation.conjugate()))
-                });
+                let back = (rotation.xyz().length() > 1e-9)
+                    .then(|| HarmonicsRotation::<f32>::new(crate::to_field::rows_of(rotation.conjugate())));
                 let rows = &node.splats.rows[range.clone()];
                 let values = &mut values[range.start * floats..range.end * floats];
                 values.par_chunks_exact_mut(floats).zip(rows).for_each(|(values, row)| {

@@ -6,7 +6,7 @@ use cif_field::{Field, Identities, Instance};
 
 use super::{Plan, instance_of};
 use crate::SceneGraph;
-use crate::build::assignment;
+use crate::from_field::assignment;
 
 /// Instance of the base table (or one added after it), or none.
 pub(super) type Owner = Option<u16>;

@@ -27,9 +27,9 @@ use glam::DVec3;
 use crate::diff::splats::{SplatPairs, coefficients, is_faded, is_recoloured, is_resized, pair};
 use crate::diff::units::{Unit, delta, key_codes, matching, step};
 use crate::diff::{Pair, SceneDiff, diff, pairs, same_rows, visibility_differs};
-use crate::field_from_graph::{InstanceTable, NodeRows, logit, rows_of};
 use crate::motion::time_map::TimeMap;
 use crate::shape::flat::log_scale;
+use crate::to_field::{InstanceTable, NodeRows, logit, rows_of};
 use crate::{Node, NodeKind, SceneError, SceneGraph, build, naming};
 use identities::{Owner, RowIdentity, unseen_members};
 use parts::subset;
@@ -139,7 +139,7 @@ impl<'a> Plan<'a> {
             let first = pair_of_nodes.before.map(|index| &exported.nodes[index]);
             let second = pair_of_nodes.after.map(|index| &edited.nodes[index]);
             if let Some(second) = second {
-                crate::field_from_graph::check(second)?;
+                crate::to_field::check(second)?;
             }
             let mut step = Step {
                 pair: pair_of_nodes,

@@ -7,7 +7,7 @@ use cif_geometry::RigidTransform;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::build::frames::{Frame, Frames};
+use crate::from_field::frames::{Frame, Frames};
 use crate::graph::{DenseSample, PoseSample, pose_at};
 use crate::motion::dense;
 use crate::motion::keys::{self, Moments};

@@ -2,7 +2,7 @@
 
 use cif_geometry::{RigidTransform, quaternion};
 
-use crate::build::frames::Frame;
+use crate::from_field::frames::Frame;
 use crate::graph::DenseSample;
 use crate::motion::keys;
 use crate::motion::placement::{angle_between, normalized_lerp};

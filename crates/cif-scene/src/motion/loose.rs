@@ -12,7 +12,7 @@ use cif_geometry::quaternion;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::build::frames::Frames;
+use crate::from_field::frames::Frames;
 use crate::motion::{dot, vector};
 
 /// Change below which a splat stands still in a picture: of its place in units of its own standard deviation (the

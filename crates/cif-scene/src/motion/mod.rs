@@ -13,7 +13,6 @@ pub mod keys;
 pub mod loose;
 pub mod parts;
 pub mod placement;
-pub mod procrustes;
 pub(crate) mod time_map;
 pub mod velocity;
 
@@ -21,12 +20,13 @@ use cif_geometry::{RigidTransform, quaternion};
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::PoseSample;
-use crate::build::frames::Frame;
+use crate::from_field::frames::Frame;
 use crate::joint::ToldParts;
 use crate::motion::keys::one_hemisphere;
-use crate::motion::procrustes::{residuals, robust_procrustes, weighted_quantile};
 use crate::report::{ResidualStatistics, TimeResidual};
 use crate::shape::proxy::systematic;
+use cif_geometry::align::procrustes::{residuals, robust_procrustes};
+use cif_geometry::stats::weighted_quantile;
 
 /// Most points that a pose is fitted to; residuals are taken over all.
 const FIT_POINTS: usize = 4096;

@@ -7,7 +7,7 @@
 //! fitting motions and choosing parts, and the best way is kept. Gaussians that several parts fit equally well
 //! follow their neighbours, so that parts hang together.
 //!
-//! Nothing is drawn at random. Outliers weigh in by the kernel of [`crate::motion::procrustes`]; they make no parts
+//! Nothing is drawn at random. Outliers weigh in by the kernel of [`cif_geometry::align::procrustes`]; they make no parts
 //! of their own unless they are many enough.
 
 use cif_geometry::RigidTransform;
@@ -16,10 +16,11 @@ use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use nalgebra::Matrix3;
 use rayon::prelude::*;
 
-use crate::build::frames::Frame;
-use crate::motion::procrustes::{weighted_procrustes, weighted_quantile};
+use crate::from_field::frames::Frame;
 use crate::motion::{trimmed_rms, vector};
 use crate::shape::proxy::systematic;
+use cif_geometry::align::procrustes::weighted_procrustes;
+use cif_geometry::stats::weighted_quantile;
 
 /// Gaussians that parts are found from.
 const SAMPLED_GAUSSIANS: usize = 512;

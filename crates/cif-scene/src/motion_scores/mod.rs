@@ -17,14 +17,15 @@ mod opacity_box;
 use std::collections::BTreeMap;
 
 use cif_dataset::{MotionTruth, TrueMotion};
+use cif_geometry::stats::median;
 use cif_geometry::transform::angle_between;
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use serde::Serialize;
 
 use self::carry::{Anchored, Placed};
-use crate::motion::procrustes::{polar_rotation, weighted_procrustes};
 use crate::{MotionModel, Node, NodeKind, SceneGraph};
+use cif_geometry::align::procrustes::{polar_rotation, weighted_procrustes};
 
 /// First times of an instance at most.
 const FIRST_TIMES: usize = 8;
@@ -222,7 +223,7 @@ fn errors(
         within_10_mm: percent(within[0]),
         within_20_mm: percent(within[1]),
         within_50_mm: percent(within[2]),
-        rotation_deg: median(angles),
+        rotation_deg: median(&mut angles),
         box_iou: Some(100.0 * overlaps / times.len() as f64),
     }
 }
@@ -247,14 +248,6 @@ fn path(motion: &TrueMotion) -> f64 {
 fn true_turn(motion: &TrueMotion, from: usize, to: usize) -> Option<DMat3> {
     let [from, to] = [from, to].map(|step| DMat3::from_mat4(motion.world_from_object[step]));
     polar_rotation(&(to * from.try_inverse()?))
-}
-
-/// Median; the mean of the middle two of an even number.
-fn median(mut values: Vec<f64>) -> Option<f64> {
-    values.sort_by(f64::total_cmp);
-    let middle = values.len() / 2;
-    let upper = *values.get(middle)?;
-    Some(if values.len() % 2 == 1 { upper } else { (values[middle - 1] + upper) / 2.0 })
 }
 
 /// Means over the measured instances that move, or that stand still.

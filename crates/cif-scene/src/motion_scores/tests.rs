@@ -248,13 +248,6 @@ fn first_times_are_eight_from_the_first_to_the_last() {
 }
 
 #[test]
-fn the_median_of_an_even_number_lies_between() {
-    assert_eq!(median(vec![5.0, 1.0, 2.0]), Some(2.0));
-    assert_eq!(median(vec![5.0, 1.0, 2.0, 4.0]), Some(3.0));
-    assert_eq!(median(Vec::new()), None);
-}
-
-#[test]
 fn boxes_reach_one_standard_deviation_without_the_outermost_opacity() {
     let quarter = DQuat::from_rotation_z(FRAC_PI_2);
     let reach = opacity_box::reach(quarter, DVec3::new(0.3, 0.1, 0.2));

@@ -12,7 +12,7 @@ use cif_geometry::{Bounds, quaternion};
 use glam::DVec3;
 
 use crate::Splats;
-use crate::motion::procrustes::weighted_quantile;
+use cif_geometry::stats::weighted_quantile;
 
 /// Share of the opacity, and of what is seen, that may be left out as straying.
 pub(super) const STRAYS: f64 = 0.04;

@@ -12,10 +12,10 @@
 use glam::DVec3;
 use nalgebra::Matrix3;
 
-use crate::motion::procrustes::weighted_quantile;
 use crate::shape::body::{Blob, Cloud, STRAYS};
 use crate::shape::convex_hull::{self, HullMesh};
 use crate::{ConvexHull, Motion, Node};
+use cif_geometry::stats::weighted_quantile;
 
 /// Share of the opacity, and of what is seen, that colliders hold at least: what strays and what few corners cut off
 /// share the rest.

@@ -10,7 +10,7 @@ use nalgebra::Matrix3;
 use parry3d_f64::math::Vector;
 use parry3d_f64::transformation::try_convex_hull;
 
-use crate::motion::procrustes::weighted_quantile;
+use cif_geometry::stats::weighted_quantile;
 
 /// Most corners of a hull; what simulators and USD physics accept.
 pub const MAX_CORNERS: usize = 64;

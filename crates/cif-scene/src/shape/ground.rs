@@ -3,8 +3,8 @@
 use cif_geometry::RigidTransform;
 use glam::DVec3;
 
-use crate::motion::procrustes::weighted_quantile;
 use crate::{Motion, Node, NodeKind, SceneGraph, UpAxis};
+use cif_geometry::stats::weighted_quantile;
 
 /// Thickness of the layer of the background that is taken for a surface, over the size of what stands on it.
 const LAYER: f64 = 0.05;

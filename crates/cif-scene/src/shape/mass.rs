@@ -13,9 +13,9 @@ use std::collections::BTreeMap;
 use cif_geometry::quaternion;
 use glam::{DVec3, IVec3};
 
-use crate::motion::procrustes::weighted_quantile;
 use crate::query::search::hull_volume;
 use crate::{ConvexHull, Motion, Node, SceneGraph};
+use cif_geometry::stats::weighted_quantile;
 
 /// Density of bodies over the volume that they fill, kg/m^3, where nobody gives another: chosen between what is hollow
 /// (a pitcher or a ball, below 100) and what is full (a can or a fruit, about 1000).

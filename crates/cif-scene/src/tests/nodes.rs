@@ -218,7 +218,7 @@ fn members_are_those_of_the_nodes() {
     let mut field = field(3);
     field.gaussians.opacity_logits[7] = -9.0;
     let options = SceneOptions::default();
-    let members = crate::build::assignment::members(&field, &options);
+    let members = crate::from_field::assignment::members(&field, &options);
     let graph = build(&field, &options).unwrap();
     assert_eq!((members.len(), members[0].len()), (3, 59), "one is too faint to be drawn");
     for (node, members) in graph.nodes.iter().zip(&members) {
@@ -227,7 +227,7 @@ fn members_are_those_of_the_nodes() {
         assert_eq!(&rows, members, "{}", node.name);
     }
     field.identities = None;
-    let none = crate::build::assignment::members(&field, &options);
+    let none = crate::from_field::assignment::members(&field, &options);
     assert!(none.len() == 3 && none.iter().all(Vec::is_empty));
 }
 

@@ -30,75 +30,65 @@ pub enum Ablation {
     NoResampling,
 }
 
-/// A system whose head the instance stage trains (methods reference 8).
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum HeadName {
+/// Declares the heads in the order of tables, a row each: the name in settings, files and tables, and the steps of the
+/// instance stage in its own publication or released configuration.
+macro_rules! heads {
+    ($($(#[$meta:meta])* $head:ident, $name:literal, $steps:expr;)*) => {
+        /// A system whose head the instance stage trains (methods reference 8).
+        #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+        pub enum HeadName {
+            $($(#[$meta])* #[serde(rename = $name)] $head,)*
+        }
+
+        impl HeadName {
+            /// Every head, in the order of tables.
+            pub const ALL: &[Self] = &[$(Self::$head),*];
+
+            /// As in settings, file names and tables.
+            #[must_use]
+            pub fn name(self) -> &'static str {
+                match self {
+                    $(Self::$head => $name,)*
+                }
+            }
+
+            /// Steps of the instance stage in its own publication or released configuration.
+            #[must_use]
+            pub fn published_steps(self) -> u32 {
+                match self {
+                    $(Self::$head => $steps,)*
+                }
+            }
+        }
+    };
+}
+
+heads! {
     /// The paper's: occupancies and calibrated distributions over instances.
     #[default]
-    Cif,
-    /// Labels counted over the strongest contributors of every pixel; nothing is trained.
-    DrSplat,
+    Cif, "cif", 3_000;
     /// A code per Gaussian and a classifier.
-    GaussianGrouping,
+    GaussianGrouping, "gaussian-grouping", 30_000;
     /// A network from place and time to codes, and a classifier.
-    Sa4d,
+    Sa4d, "sa4d", 5_000;
     /// Language channels fused with colour by attention, with an opacity of their own. A re-implementation: there is
     /// no public code.
-    Vlgs,
+    Vlgs, "vlgs", 15_000;
+    /// Labels counted over the strongest contributors of every pixel; nothing is trained.
+    DrSplat, "dr-splat", 0;
     /// Gaussians of several labels split or deleted, then codes learnt by contrast.
-    Trace3d,
+    // Splitting and deleting, then lifting.
+    Trace3d, "trace3d", 9_000 + 20_000;
     /// Three language channels learnt of given feature maps. It tells no instances apart, and answers questions alone.
-    #[serde(rename = "4d-langsplat")]
-    LangSplat,
+    // Of the language channels, on Gaussians that move.
+    LangSplat, "4d-langsplat", 10_000;
 }
 
 impl HeadName {
-    /// Every head, in the order of tables.
-    pub const ALL: [Self; 7] = [
-        Self::Cif,
-        Self::GaussianGrouping,
-        Self::Sa4d,
-        Self::Vlgs,
-        Self::DrSplat,
-        Self::Trace3d,
-        Self::LangSplat,
-    ];
-
     /// True when it tells labels of pixels; false when it only answers questions.
     #[must_use]
     pub fn tells_labels(self) -> bool {
         self != Self::LangSplat
-    }
-
-    /// As in settings, file names and tables.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Cif => "cif",
-            Self::DrSplat => "dr-splat",
-            Self::GaussianGrouping => "gaussian-grouping",
-            Self::Sa4d => "sa4d",
-            Self::Vlgs => "vlgs",
-            Self::Trace3d => "trace3d",
-            Self::LangSplat => "4d-langsplat",
-        }
-    }
-
-    /// Steps of the instance stage in its own publication or released configuration.
-    #[must_use]
-    pub fn published_steps(self) -> u32 {
-        match self {
-            Self::Cif => 3_000,
-            Self::DrSplat => 0,
-            Self::GaussianGrouping => 30_000,
-            Self::Sa4d => 5_000,
-            Self::Vlgs => 15_000,
-            // Splitting and deleting, then lifting.
-            Self::Trace3d => 9_000 + 20_000,
-            // Of the language channels, on Gaussians that move.
-            Self::LangSplat => 10_000,
-        }
     }
 }
 

@@ -21,9 +21,9 @@ use cif_field::Field;
 use cif_render::cpu::IdentityCounts;
 use cif_render::{Channels, RenderSettings, RenderedImage};
 
-use crate::densify::Rearrangement;
+use crate::density::Rearrangement;
+use crate::density::relocate::{Pair, Relocated};
 use crate::error::TrainError;
-use crate::resample::{Pair, Relocated};
 use crate::state::State;
 use crate::step::{StepPlan, StepReport};
 

@@ -10,14 +10,14 @@ use cif_render::cpu::{BlendWeightGradients, IdentityCounts, Renderer, SimdLevel}
 use cif_render::{BlendRequest, Channels, GeometryPath, Gradients, RenderSettings, RenderedImage};
 
 use super::{Changed, Engine, Views};
-use crate::densify::Rearrangement;
+use crate::density::Rearrangement;
+use crate::density::relocate::{Pair, Relocated};
 use crate::error::TrainError;
 use crate::guard::{Fault, exposure_fault, gradient_fault, loss_fault, value_fault};
 use crate::heads;
 use crate::losses::held_out::leave_out_held_out;
 use crate::losses::{SsimScratch, color_loss};
 use crate::poses::{object_sizes, pose_fault};
-use crate::resample::{Pair, Relocated};
 use crate::stage::Stage;
 use crate::state::State;
 use crate::step::{StepPlan, StepReport, StepView, ViewReport};

@@ -13,11 +13,9 @@
 
 use cif_field::Field;
 use cif_field::parameters::{Activation, OnCopy, Parameter, Rows};
-use cif_render::Blending;
 use cif_render::cpu::{ContributorMass, ContributorRule};
 
-use super::{Head, HeadLoss, HeadTensors, HeadValues, HeadView, Pass, TrainingViews, ValueHead, largest};
-use crate::config::TrainConfig;
+use super::{HeadLoss, HeadTensors, HeadValues, HeadView, TrainingViews, ValueHead, largest};
 use crate::error::TrainError;
 
 /// Contributors of a pixel that count, in the published command.
@@ -55,16 +53,6 @@ impl DrSplat {
     }
 }
 
-impl Head for DrSplat {
-    fn name(&self) -> &'static str {
-        "dr-splat"
-    }
-
-    fn pass(&self, _config: &TrainConfig) -> Pass<'_> {
-        Pass::Values(self)
-    }
-}
-
 impl ValueHead for DrSplat {
     fn parameters(&self) -> Vec<Parameter> {
         vec![LABELS]
@@ -80,10 +68,6 @@ impl ValueHead for DrSplat {
 
     fn channels(&self, field: &Field) -> usize {
         field.instances.len()
-    }
-
-    fn blending(&self) -> Blending {
-        Blending::Color
     }
 
     fn values(&self, tensors: &HeadTensors, field: &Field, _time: f64) -> Vec<f32> {

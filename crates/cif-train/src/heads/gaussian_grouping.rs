@@ -16,14 +16,12 @@
 use cif_field::Field;
 use cif_field::parameters::Parameter;
 use cif_geometry::spherical_harmonics::BAND_0;
-use cif_render::Blending;
 use rand::RngExt;
 
 use super::classifier::{Classifier, biases, neighbours, weights};
 use super::tensors::per_gaussian;
-use super::{Head, HeadLoss, HeadStep, HeadTensors, HeadValues, HeadView, Pass, ValueHead};
+use super::{HeadLoss, HeadStep, HeadTensors, HeadView, ValueHead};
 use crate::adam::EPSILON;
-use crate::config::TrainConfig;
 use crate::random::{Purpose, stream};
 
 /// Width of a code.
@@ -53,16 +51,6 @@ const CLASSIFIER: Classifier = Classifier {
 #[derive(Clone, Copy, Debug, Default)]
 pub struct GaussianGrouping;
 
-impl Head for GaussianGrouping {
-    fn name(&self) -> &'static str {
-        "gaussian-grouping"
-    }
-
-    fn pass(&self, _config: &TrainConfig) -> Pass<'_> {
-        Pass::Values(self)
-    }
-}
-
 impl ValueHead for GaussianGrouping {
     fn parameters(&self) -> Vec<Parameter> {
         vec![CODES, CLASSIFIER.weights, CLASSIFIER.biases]
@@ -84,20 +72,8 @@ impl ValueHead for GaussianGrouping {
         if *parameter == CODES { EPSILON } else { CLASSIFIER_EPSILON }
     }
 
-    fn channels(&self, _field: &Field) -> usize {
-        CODE
-    }
-
-    fn blending(&self) -> Blending {
-        Blending::Color
-    }
-
-    fn values(&self, tensors: &HeadTensors, _field: &Field, _time: f64) -> Vec<f32> {
-        tensors.values(&CODES).to_vec()
-    }
-
-    fn values_backward(&self, tensors: &mut HeadTensors, _: &Field, _: &HeadValues, v_values: &[f32]) {
-        tensors.add_gradients(&CODES, v_values);
+    fn codes(&self) -> Parameter {
+        CODES
     }
 
     fn loss(

@@ -51,7 +51,7 @@ pub use self::views::TrainingViews;
 pub use self::vlgs::Vlgs;
 use crate::adam::EPSILON;
 use crate::config::{HeadConfig, HeadName, TrainConfig};
-use crate::densify::Rearrangement;
+use crate::density::Rearrangement;
 use crate::error::TrainError;
 
 /// The head that settings name.
@@ -174,6 +174,23 @@ impl From<Vec<f32>> for HeadValues {
     }
 }
 
+/// Implements [`Head`] for heads that blend values of their own, under the name that settings have for them.
+macro_rules! value_heads {
+    ($($head:ident),*) => {
+        $(impl Head for $head {
+            fn name(&self) -> &'static str {
+                HeadName::$head.name()
+            }
+
+            fn pass(&self, _config: &TrainConfig) -> Pass<'_> {
+                Pass::Values(self)
+            }
+        })*
+    };
+}
+
+value_heads!(DrSplat, GaussianGrouping, LangSplat, Sa4d, Trace3d, Vlgs);
+
 /// A head that blends values of its own. Gradients reach its tensors, and its own opacities where it has such.
 pub trait ValueHead: Send + Sync {
     /// What its blended values are held to.
@@ -215,14 +232,29 @@ pub trait ValueHead: Send + Sync {
         Phase::Head
     }
 
+    /// Tensor whose rows are the values of the Gaussians at all times. Heads that compute values in another manner have
+    /// none, and their own [`Self::channels`], [`Self::values`] and [`Self::values_backward`].
+    ///
+    /// # Panics
+    /// Where a head has neither.
+    fn codes(&self) -> Parameter {
+        panic!("a head has codes, or values of its own")
+    }
+
     /// Number of values C per Gaussian.
-    fn channels(&self, field: &Field) -> usize;
+    fn channels(&self, _field: &Field) -> usize {
+        self.codes().width()
+    }
 
     /// Weights that the values are blended with.
-    fn blending(&self) -> Blending;
+    fn blending(&self) -> Blending {
+        Blending::Color
+    }
 
     /// The values at a time, `[N, C]`.
-    fn values(&self, tensors: &HeadTensors, field: &Field, time: f64) -> Vec<f32>;
+    fn values(&self, tensors: &HeadTensors, _field: &Field, _time: f64) -> Vec<f32> {
+        tensors.values(&self.codes()).to_vec()
+    }
 
     /// The values of some rows, ascending, at a time, and what the way back needs of them. Heads whose values cost
     /// nothing give those of all rows.
@@ -234,10 +266,12 @@ pub trait ValueHead: Send + Sync {
     fn values_backward(
         &self,
         tensors: &mut HeadTensors,
-        field: &Field,
-        values: &HeadValues,
+        _field: &Field,
+        _values: &HeadValues,
         v_values: &[f32],
-    );
+    ) {
+        tensors.add_gradients(&self.codes(), v_values);
+    }
 
     /// Loss of a view. Its gradient times `weight` by the blended values is added to `v_blended`, `[height, width,
     /// C]`; gradients by tensors that the loss itself uses are added too.

@@ -7,6 +7,7 @@
 use cif_dataset::{Dataset, Frame, InstanceLabel, Split};
 use cif_field::{Field, RecordedCamera};
 use cif_geometry::PinholeCamera;
+use cif_geometry::stats::upper_median;
 
 /// Camera centres that are nearer to each other are one place, in scene extents.
 const SAME_PLACE: f64 = 1e-3;
@@ -48,7 +49,7 @@ pub fn misfits(field: &Field, dataset: &Dataset, split: Split) -> Vec<Misfit> {
     let extent = f64::from(field.extent).max(f64::MIN_POSITIVE);
     let recorded: Vec<Recorded<'_>> = field.cameras.iter().map(Recorded::of).collect();
     let views: Vec<View> = frames.iter().map(|frame| View::of(frame, &recorded, field, extent)).collect();
-    let unknown: Vec<f64> = views.iter().filter_map(|view| view.distance_if_unknown).collect();
+    let mut unknown: Vec<f64> = views.iter().filter_map(|view| view.distance_if_unknown).collect();
     let mut found = Vec::new();
     let is_other_place = 2 * unknown.len() > views.len();
     if is_other_place {
@@ -61,7 +62,7 @@ pub fn misfits(field: &Field, dataset: &Dataset, split: Split) -> Vec<Misfit> {
                 unknown.len(),
                 views.len(),
                 recorded.len(),
-                median(unknown)
+                upper_median(&mut unknown).unwrap_or_default()
             ),
         });
     } else if !unknown.is_empty() {
@@ -182,11 +183,6 @@ fn other_instances(field: &Field, dataset: &Dataset, is_other_place: bool) -> Op
 /// True where a label only repeats the id.
 fn is_placeholder(label: &str, id: u16) -> bool {
     label.strip_prefix("instance_").is_some_and(|number| number.parse() == Ok(id))
-}
-
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or_default()
 }
 
 #[cfg(test)]

@@ -498,6 +498,7 @@ mod tests {
     }
 
     #[test]
+    #[ignore = "long: make test-long"]
     fn several_cameras_show_turns_however_fast() {
         // A third of a turn from time to time, and the other way round after a bounce.
         let fast = |time: usize| {
@@ -529,6 +530,7 @@ mod tests {
     }
 
     #[test]
+    #[ignore = "long: make test-long"]
     fn a_plain_ball_does_not_show_its_turns() {
         assert!(thrown(|_| [0.8, 0.5, 0.2], even, jumping).is_none());
         assert!(thrown(|_| [0.8, 0.5, 0.2], even, rig).is_none());

@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 
 use cif_geometry::quaternion;
+use cif_geometry::scalar::direct_sigmoid;
 use cif_render::PoseGradient;
 use glam::DVec3;
 
@@ -112,7 +113,7 @@ impl Fit<'_> {
             heights.push(plane.height(pose.rotation * mean + pose.translation) - along.sqrt());
         }
         let lowest = heights.iter().copied().fold(f64::INFINITY, f64::min);
-        let opacity = |row: usize| 1.0 / (1.0 + f64::from(-g.opacity_logits[row]).exp());
+        let opacity = |row: usize| direct_sigmoid(f64::from(g.opacity_logits[row]));
         let mut weights: Vec<f64> = heights
             .iter()
             .enumerate()

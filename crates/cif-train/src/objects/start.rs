@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 
 use cif_field::Gaussians;
 use cif_field::tracks::RotationEvidence;
+use cif_geometry::scalar::direct_sigmoid;
 use glam::{DQuat, DVec3};
 use rand_pcg::Pcg64;
 use rayon::prelude::*;
@@ -391,7 +392,7 @@ fn shares(fit: &mut Fit<'_>) -> BTreeMap<usize, f64> {
 /// Turns an object as it rolls without slip along its path, about its middle.
 fn roll_along(fit: &mut Fit<'_>, plane: &Plane, radius: f64) {
     let g = fit.shape.gaussians();
-    let weight = |row: usize| 1.0 / (1.0 + f64::from(-g.opacity_logits[row]).exp());
+    let weight = |row: usize| direct_sigmoid(f64::from(g.opacity_logits[row]));
     let total: f64 = (0..g.len()).map(weight).sum();
     let sum: DVec3 =
         (0..g.len()).map(|row| weight(row) * DVec3::from_array(g.means[row].map(f64::from))).sum();

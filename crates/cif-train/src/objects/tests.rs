@@ -142,6 +142,7 @@ fn what_rests_and_is_cut_at_all_times_is_left_alone() {
 }
 
 #[test]
+#[ignore = "long: make test-long"]
 fn what_comes_to_rest_as_soon_as_it_is_seen_is_followed_to_the_border() {
     let right = DVec3::new(0.5_f64.cos(), 0.5_f64.sin(), 0.0);
     let truth: Vec<(DQuat, DVec3)> = (0..TIMES)
@@ -160,6 +161,7 @@ fn what_comes_to_rest_as_soon_as_it_is_seen_is_followed_to_the_border() {
 }
 
 #[test]
+#[ignore = "long: make test-long"]
 fn what_shows_a_broader_side_is_not_lifted() {
     let truth: Vec<(DQuat, DVec3)> = (0..TIMES)
         .map(|k| {
@@ -190,6 +192,7 @@ fn falling() -> Vec<(DQuat, DVec3)> {
 }
 
 #[test]
+#[ignore = "long: make test-long"]
 fn what_falls_over_is_followed() {
     let truth = falling();
     let tall = sides(DVec3::new(0.03, 0.03, 0.08));
@@ -291,6 +294,7 @@ fn several_cameras_follow_an_object_that_is_lifted_and_tilted() {
 }
 
 #[test]
+#[ignore = "long: make test-long"]
 fn one_camera_follows_an_object_from_where_it_stood_to_its_other_side() {
     let truth: Vec<(DQuat, DVec3)> = (0..TIMES)
         .map(|k| {
@@ -376,6 +380,7 @@ fn times_that_hardly_show_it_are_off_the_support_between_times_that_are() {
 }
 
 #[test]
+#[ignore = "long: make test-long"]
 fn a_bar_that_rolls_about_its_long_axis_is_found_by_its_texture() {
     let mut rng = stream(0, Purpose::Objects, 14);
     let places: Vec<DVec3> = (0..2500)
@@ -459,6 +464,7 @@ fn a_camera_that_jumps_follows_what_is_thrown_and_spins() {
 }
 
 #[test]
+#[ignore = "long: make test-long"]
 fn how_a_plain_ball_turns_in_the_air_is_assumed() {
     let place = |k: usize| {
         let share = k as f64 / (TIMES - 1) as f64;

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::f64::consts::PI;
 use std::sync::Arc;
 
-use cif_geometry::{PinholeCamera, PixelGrid};
+use cif_geometry::{PinholeCamera, PixelGrid, stats};
 use cif_render::{RenderSettings, UNLABELLED};
 use glam::DVec2;
 
@@ -215,12 +215,7 @@ pub(super) fn are_discs<'a>(views: impl Iterator<Item = &'a ObjectView>) -> bool
 
 /// Middle value; 0 of nothing.
 pub(super) fn median(values: &mut [f64]) -> f64 {
-    values.sort_by(f64::total_cmp);
-    match values.len() {
-        0 => 0.0,
-        n if n % 2 == 1 => values[n / 2],
-        n => 0.5 * (values[n / 2 - 1] + values[n / 2]),
-    }
+    stats::median(values).unwrap_or(0.0)
 }
 
 fn crop(

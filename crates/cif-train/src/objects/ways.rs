@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 
 use cif_field::Gaussians;
+use cif_geometry::scalar::direct_sigmoid;
 use glam::{DQuat, DVec3};
 use nalgebra::{Matrix3, Vector3};
 
@@ -262,7 +263,7 @@ impl Bar {
 
 /// Long axis of Gaussians, as of a bar that lies in a plane.
 fn long_axis(gaussians: &Gaussians, up: DVec3) -> Option<DVec3> {
-    let weight = |row: usize| 1.0 / (1.0 + f64::from(-gaussians.opacity_logits[row]).exp());
+    let weight = |row: usize| direct_sigmoid(f64::from(gaussians.opacity_logits[row]));
     let place = |row: usize| DVec3::from_array(gaussians.means[row].map(f64::from));
     let rows = || 0..gaussians.len();
     let total: f64 = rows().map(weight).sum();

@@ -10,7 +10,7 @@ use super::Trainer;
 use super::guard_tests::support::{Scene, capture, small_config};
 use crate::clock::{Clock, Seconds};
 use crate::config::TrainConfig;
-use crate::densify::DensifyStatistics;
+use crate::density::DensifyStatistics;
 use crate::engine::Views;
 use crate::engine::gpu::GpuEngine;
 use crate::engine::processor::Processor;

@@ -15,7 +15,7 @@ use crate::engine::{Changed, Views};
 use crate::error::TrainError;
 use crate::events::TrainEvent;
 use crate::losses::held_out::held_out;
-use crate::schedule::{falls_on, sh_degree};
+use crate::schedule::{Due, sh_degree};
 use crate::stage::Stage;
 
 /// Views that are compared.
@@ -31,20 +31,9 @@ fn judged_views(views: usize) -> impl Iterator<Item = usize> {
 }
 
 impl Trainer {
-    /// True when anything is still to be judged by pixels that are held out; then all pixels train.
-    fn judges(&self, stage: Stage, iteration: u32) -> bool {
-        let effects = &self.state.config.effects;
-        let half = self.stages.iterations(&self.state.config, Stage::Fine) / 2;
-        let earns = effects.sh_gain > 0.0 || effects.head_gain > 0.0;
-        (earns && (stage == Stage::Coarse || (stage == Stage::Fine && iteration <= half)))
-            || self.tests_to_come(stage, iteration)
-    }
-
-    /// True when a step keeps the pixels that are judged by out of the colour gradient of a frame of the capture:
-    /// while anything is still to be judged, and where the frame is one of those that are judged by.
-    pub(super) fn leaves_out_judged(&self, stage: Stage, iteration: u32, frame: usize) -> bool {
+    /// True where a frame of the capture is one of those that effects are judged by.
+    pub(super) fn is_judged_by(&self, frame: usize) -> bool {
         judged_views(self.state.frames.len()).any(|view| self.state.frames.index(view) == frame)
-            && self.judges(stage, iteration)
     }
 
     /// Degree of spherical harmonics at a step: as the schedule says, but not two above one that helps, and not
@@ -57,15 +46,12 @@ impl Trainer {
         scheduled.min(self.state.progress.sh_judged + 1).min(self.state.progress.sh_cap.unwrap_or(u8::MAX))
     }
 
-    /// True when spherical harmonics are judged before a step.
-    pub(super) fn judges_sh(&self, stage: Stage, iteration: u32) -> bool {
-        if self.state.config.effects.sh_gain <= 0.0 || !matches!(stage, Stage::Coarse | Stage::Fine) {
-            return false;
-        }
-        let is_next_due = falls_on(iteration, self.state.config.model.sh_interval)
-            && self.state.progress.sh_cap.is_none()
-            && self.state.field.sh_degree > self.state.progress.sh_judged;
-        is_next_due || self.is_half_way(stage, iteration)
+    /// True when spherical harmonics are judged before the step that comes next.
+    pub(super) fn judges_harmonics(&self) -> bool {
+        let progress = &self.state.progress;
+        let is_open = progress.sh_cap.is_none() && self.state.field.sh_degree > progress.sh_judged;
+        let coming = self.coming();
+        coming.has(Due::TakeBackHarmonics) || (is_open && coming.has(Due::TryHarmonics))
     }
 
     /// Looks whether the present degree of spherical harmonics helps where the next one is due, and at half of the
@@ -76,10 +62,7 @@ impl Trainer {
         iteration: u32,
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
-        if !self.judges_sh(stage, iteration) {
-            return Ok(());
-        }
-        if self.is_half_way(stage, iteration) {
+        if self.coming().has(Due::TakeBackHarmonics) {
             while self.state.field.sh_degree > 0 {
                 let gain_wanted = f64::from(self.state.config.effects.sh_gain);
                 let degree = self.state.field.sh_degree;
@@ -120,19 +103,6 @@ impl Trainer {
         Ok(kept)
     }
 
-    /// True when a step is the one on which what has not earned its place is taken back.
-    fn is_half_way(&self, stage: Stage, iteration: u32) -> bool {
-        let last = self.stages.iterations(&self.state.config, Stage::Fine);
-        stage == Stage::Fine && iteration == (last / 2).max(1)
-    }
-
-    /// True when outputs of the deformation are judged after a step.
-    pub(super) fn judges_heads(&self, stage: Stage, iteration: u32) -> bool {
-        self.state.config.effects.head_gain > 0.0
-            && self.is_half_way(stage, iteration)
-            && self.state.field.deformation.is_some()
-    }
-
     /// Judges the optional outputs of the deformation, once, at half of the fine stage, and removes those that do
     /// not help.
     pub(super) fn judge_heads(
@@ -142,9 +112,6 @@ impl Trainer {
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
         let gain_wanted = f64::from(self.state.config.effects.head_gain);
-        if !self.judges_heads(stage, iteration) {
-            return Ok(());
-        }
         let settings = self.state.color_settings();
         let times = probe_times(&self.state.dataset.times);
         for kind in OPTIONAL {

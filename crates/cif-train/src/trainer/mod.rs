@@ -93,7 +93,8 @@ use self::saving::Saving;
 use crate::clock::{Clock, Seconds};
 use crate::config::{HeadName, TrainConfig};
 use crate::curve::Curve;
-use crate::densify::DensifyStatistics;
+use crate::density::adaptive::Adaptive;
+use crate::density::{DensifyStatistics, Strategy};
 use crate::engine::Engine;
 use crate::engine::processor::Processor;
 use crate::error::TrainError;
@@ -107,7 +108,8 @@ use crate::optimiser::Optimiser;
 use crate::phase::Phase;
 use crate::phases::Phases;
 use crate::poses::PoseMoments;
-use crate::progress::{Progress, Stages};
+use crate::progress::Progress;
+use crate::schedule::{Facts, Moment, Stages};
 use crate::stage::Stage;
 use crate::state::State;
 use crate::step::StepLoss;
@@ -158,6 +160,8 @@ fn switch_note(dataset: &Dataset, switched: &BTreeMap<usize, BTreeMap<u16, u16>>
 /// Trains one field on one capture.
 pub struct Trainer {
     state: State,
+    /// Adds and removes Gaussians.
+    density: Arc<dyn Strategy>,
     /// Computes the steps.
     engine: Box<dyn Engine>,
     /// Vector instructions of the processor.
@@ -275,6 +279,7 @@ impl Trainer {
         let simd = SimdLevel::Auto;
         Ok(Self {
             stages: Stages { is_dynamic: config.effects.motion && dataset.times.len() > 1, has_instances },
+            density: Arc::new(Adaptive),
             engine: Box::new(Processor::new(simd)),
             simd,
             order: None,
@@ -359,6 +364,30 @@ impl Trainer {
         }
     }
 
+    /// A step of a stage (from 1), and of all stages, as the schedule sees it.
+    fn moment(&self, stage: Stage, iteration: u32, total: u64) -> Moment<'_> {
+        let state = &self.state;
+        let facts = Facts {
+            stages: self.stages,
+            sees_changes: self.shows_changes,
+            knows_travelling: state.guidance.knows_what_travels() || state.field.tracks.is_some(),
+            owns_identities: state.value_head().is_none(),
+        };
+        Moment { config: &state.config, stage, iteration, total, facts }
+    }
+
+    /// The step that comes next.
+    fn coming(&self) -> Moment<'_> {
+        let Progress { stage, iteration, total_steps, .. } = self.state.progress;
+        self.moment(stage, iteration + 1, total_steps + 1)
+    }
+
+    /// The step that was done last.
+    fn done(&self) -> Moment<'_> {
+        let Progress { stage, iteration, total_steps, .. } = self.state.progress;
+        self.moment(stage, iteration, total_steps)
+    }
+
     /// The field as it is now; its record is up to date once a run has returned.
     #[must_use]
     pub fn field(&self) -> &Field {
@@ -427,6 +456,12 @@ impl Trainer {
     pub fn set_head(&mut self, head: Arc<dyn Head>) -> Result<(), TrainError> {
         self.state.head = head;
         self.restore_head()
+    }
+
+    /// Adds and removes Gaussians by other rules than [`Adaptive`]. They are not saved with the run: one that is resumed
+    /// is to be given them again.
+    pub fn set_density(&mut self, strategy: Arc<dyn Strategy>) {
+        self.density = strategy;
     }
 
     /// Reads time from another clock; times of the run and its curve follow it.

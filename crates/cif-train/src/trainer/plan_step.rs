@@ -19,13 +19,10 @@ use crate::heads::{CameraBlending, Phase, Target, ValueHead};
 use crate::metrics::image::{ssim, unit_color};
 use crate::optimiser::StepRates;
 use crate::random::{Purpose, stream};
-use crate::schedule::{log_linear, schedule_steps};
+use crate::schedule::{Due, log_linear, schedule_steps};
 use crate::stage::Stage;
 use crate::state::State;
 use crate::step::{HeadTarget, StepPlan, StepView};
-
-/// Steps between renormalisations of the raw quaternions, which keep their effective rate (row 18).
-const RENORMALISE_EVERY: u64 = 1_000;
 
 impl Trainer {
     /// Training views of a stage, those of a head's own cameras where it trains on some alone.
@@ -65,12 +62,15 @@ impl Trainer {
     /// The plan of a step of a stage, from 1.
     pub(super) fn plan_step(&mut self, stage: Stage, iteration: u32) -> Result<StepPlan, TrainError> {
         let batch = self.state.config.stages.batch;
+        let at = self.moment(stage, iteration, self.state.progress.total_steps + 1);
+        let [holds_out, renormalises] = [Due::HoldOut, Due::Renormalise].map(|due| at.has(due));
+        let counts_statistics = at.is_of_colors() && self.density.counts_statistics(&at);
         let mut views = Vec::with_capacity(batch as usize);
         for k in 0..batch {
             let view = self.view_at(stage, u64::from(iteration - 1) * u64::from(batch) + u64::from(k));
             let frame = self.state.frames.get(&self.state.dataset, view)?;
             let index = self.state.frames.index(view);
-            let leaves_judged = self.leaves_out_judged(stage, iteration, index);
+            let leaves_judged = holds_out && self.is_judged_by(index);
             views.push(StepView { index, frame, leaves_judged });
         }
         self.expect_views(stage, u64::from(iteration) * u64::from(batch));
@@ -107,12 +107,11 @@ impl Trainer {
                 .then(|| exposure_rate(config, self.state.progress.total_steps)),
             weights: plane_weights(config),
             visible_rows_only: config.adam.visible_rows_only,
-            counts_statistics: matches!(stage, Stage::Coarse | Stage::Fine)
-                && iteration < config.densify.until,
+            counts_statistics,
             occupancy_limits: (with_instances && !config.ablates(Ablation::ConstantOccupancy))
                 .then(|| instance.occupancy_limits.map(logit)),
             calibration_limit: with_instances.then_some(instance.calibration_limit),
-            renormalises: (self.state.progress.total_steps + 1).is_multiple_of(RENORMALISE_EVERY),
+            renormalises,
         })
     }
 }

@@ -14,7 +14,7 @@ use super::Trainer;
 use super::evaluate::MeasuredFrames;
 use super::known::KnownObjects;
 use crate::config::TrainConfig;
-use crate::densify::DensifyStatistics;
+use crate::density::DensifyStatistics;
 use crate::error::TrainError;
 use crate::heads::{Cif, Head, HeadTensors, value_head};
 use crate::optimiser::Optimiser;

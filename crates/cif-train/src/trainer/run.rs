@@ -8,7 +8,7 @@ use super::known::KnownObjects;
 use super::saving::Saving;
 use super::{Trainer, TrainerView, initialize, provenance};
 use crate::curve::MIN_GAP;
-use crate::densify::DensifyStatistics;
+use crate::density::DensifyStatistics;
 use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::events::{Control, Outcome, TrainEvent};
@@ -16,7 +16,7 @@ use crate::heads::{self, Target};
 use crate::optimiser::Optimiser;
 use crate::phase::Phase;
 use crate::progress::{AfterStep, Progress};
-use crate::schedule::falls_on;
+use crate::schedule::Due;
 use crate::stage::Stage;
 use crate::step::StepLoss;
 
@@ -196,7 +196,7 @@ impl Trainer {
             let iteration = self.state.progress.iteration;
             let iterations = self.stages.iterations(&self.state.config, stage);
             if let Some(loss) = loss
-                && (falls_on(iteration, self.state.config.report.step_every) || iteration == iterations)
+                && self.done().has(Due::Report)
             {
                 let spent = phases.spent(phase).wall_s;
                 let rate = f64::from(lap_steps) / (spent - lap).max(1e-9);
@@ -223,16 +223,14 @@ impl Trainer {
                 self.follow_budget(stage);
             }
             self.state.progress.after_step = Some(AfterStep::Evaluation);
-            let total = (self.state.progress.total_steps % u64::from(u32::MAX)) as u32;
-            if falls_on(total, self.state.config.report.evaluate_every) {
+            if self.done().has(Due::Evaluate) {
                 self.fetch()?;
                 let event = self.evaluate(stage)?;
                 requests.add(self.emit(observer, &event));
             }
             self.state.progress.after_step = None;
-            let report = &self.state.config.report;
-            if falls_on(total, report.checkpoint_every)
-                || self.saving.is_due(report.checkpoint_seconds, self.now_s())
+            if self.done().has(Due::Save)
+                || self.saving.is_due(self.state.config.report.checkpoint_seconds, self.now_s())
                 || requests.save
             {
                 requests.save = false;

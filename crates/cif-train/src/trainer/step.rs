@@ -1,5 +1,6 @@
 //! One optimiser step, and what changes the field behind it.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use cif_field::Field;
@@ -8,7 +9,9 @@ use cif_render::{Gradients, RenderedImage};
 
 use super::Trainer;
 use crate::config::Ablation;
-use crate::densify::{DensifyStatistics, Rearrangement, add_gaussians, prune, reset_opacities};
+use crate::density::adaptive::reset_opacities;
+use crate::density::relocate::{ResampleContext, apply, choose};
+use crate::density::{Change, DensifyStatistics, Rearrangement, Rows};
 use crate::engine::processor::Processor;
 use crate::engine::{Views, validation};
 use crate::error::TrainError;
@@ -16,7 +19,6 @@ use crate::events::TrainEvent;
 use crate::guard::{Hint, MAX_ROLLBACKS_IN_A_ROW};
 use crate::progress::AfterStep;
 use crate::random::{Purpose, stream};
-use crate::resample::{ResampleContext, apply, choose};
 use crate::schedule::Due;
 use crate::stage::Stage;
 use crate::step::{StepLoss, StepReport};
@@ -34,7 +36,7 @@ impl Trainer {
     fn try_step(&mut self, events: &mut Vec<TrainEvent>) -> Result<StepLoss, TrainError> {
         let start = Instant::now();
         let (stage, iteration) = (self.state.progress.stage, self.state.progress.iteration + 1);
-        if self.judges_sh(stage, iteration) {
+        if self.judges_harmonics() {
             self.fetch()?;
             self.judge_sh(stage, iteration, events)?;
         }
@@ -141,23 +143,18 @@ impl Trainer {
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
         let iteration = self.state.progress.iteration;
-        let mut due = Due::after(
-            &self.state.config,
-            stage,
-            iteration,
-            self.stages.iterations(&self.state.config, stage),
-        );
-        if self.state.value_head().is_some() {
-            // Identity rows are those of the other head.
-            (due.estimates_identities, due.resamples) = (false, false);
-        }
-        let judges = [self.judges_heads(stage, iteration), self.settles(stage, iteration)];
-        if judges.contains(&true) || due.estimates_identities || self.engine.is_far_ahead() {
+        let due = self.done().all();
+        let falls = |what: Due| due.contains(&what);
+        let judges = [Due::JudgeOutputs, Due::TestStill]
+            .map(|judged| self.state.field.deformation.is_some() && falls(judged));
+        if judges.contains(&true) || falls(Due::EstimateIdentities) || self.engine.is_far_ahead() {
             self.fetch()?;
         }
         if self.state.progress.after_step == Some(AfterStep::Changes) {
             self.rearrange_by_head(stage, iteration, events)?;
-            if due.changes_gaussians() {
+            let done = self.done();
+            let densifies = done.is_of_colors() && self.density.changes(&done) > 0;
+            if densifies || falls(Due::EstimateIdentities) || falls(Due::Resample) {
                 self.change_gaussians(stage, iteration, &due, events)?;
             }
             self.state.progress.after_step = Some(AfterStep::Heads);
@@ -182,17 +179,16 @@ impl Trainer {
         &mut self,
         stage: Stage,
         iteration: u32,
-        due: &Due,
+        due: &[Due],
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
         self.receive(true)?;
         self.engine.begin_changes(&mut self.state, stage == Stage::Instance)?;
         let changed = match stage {
-            Stage::Instance => self.instance_events(iteration, due, events),
-            _ => self.densify(stage, iteration, due, events),
+            Stage::Instance => self.instance_events(iteration, due, events).map(|()| false),
+            _ => self.densify(stage, iteration, events),
         };
-        let resets_opacities = changed.is_ok().then_some(due.resets_opacities);
-        let taken = self.engine.end_changes(&mut self.state, resets_opacities);
+        let taken = self.engine.end_changes(&mut self.state, changed.as_ref().ok().copied());
         changed.and(taken)
     }
 
@@ -214,49 +210,49 @@ impl Trainer {
         result
     }
 
-    /// Pruning, additions and opacity resets that fall on this step.
+    /// Makes the changes that the densification strategy has behind this step; true when opacities were capped.
     fn densify(
         &mut self,
         stage: Stage,
         iteration: u32,
-        due: &Due,
         events: &mut Vec<TrainEvent>,
-    ) -> Result<(), TrainError> {
-        let config = self.state.config.densify.clone();
-        let extent = self.state.field.extent;
-        let (mut cloned, mut split, mut pruned) = (0, 0, 0);
-        if due.prunes {
-            let reset = self.state.progress.opacities_were_reset;
-            if let Some(change) =
-                prune(&self.state.field.gaussians, &self.state.statistics, &config, extent, reset)
-            {
+    ) -> Result<bool, TrainError> {
+        let strategy = Arc::clone(&self.density);
+        let mut rng = stream(self.state.config.seed, Purpose::Split, self.state.progress.total_steps);
+        let (mut cloned, mut split, mut pruned, mut capped) = (0, 0, 0, false);
+        for k in 0..strategy.changes(&self.done()) {
+            let state = &self.state;
+            let rows = Rows {
+                gaussians: &state.field.gaussians,
+                statistics: &state.statistics,
+                extent: state.field.extent,
+                opacities_were_reset: state.progress.opacities_were_reset,
+            };
+            let Change { rearrangement, restarts_statistics, opacity_cap } =
+                strategy.change(k, &self.done(), &rows, &mut rng);
+            if let Some(change) = rearrangement {
                 if change.gaussians.is_empty() {
                     return Err(TrainError::NoGaussians { stage, iteration });
                 }
-                pruned = change.pruned;
+                (cloned, split, pruned) =
+                    (cloned + change.cloned, split + change.split, pruned + change.pruned);
                 self.rearrange(change);
             }
-        }
-        if due.adds {
-            let mut rng = stream(self.state.config.seed, Purpose::Split, self.state.progress.total_steps);
-            let change =
-                add_gaussians(&self.state.field.gaussians, &self.state.statistics, &config, extent, &mut rng);
-            if let Some(change) = change {
-                (cloned, split) = (change.cloned, change.split);
-                self.rearrange(change);
+            if restarts_statistics {
+                self.state.statistics = DensifyStatistics::zeros(self.state.field.gaussians.len());
             }
-            self.state.statistics = DensifyStatistics::zeros(self.state.field.gaussians.len());
-        }
-        if due.resets_opacities {
-            reset_opacities(&mut self.state.field.gaussians, config.opacity_reset_to);
-            self.state.optimiser.of(&OPACITY_LOGITS).reset_all();
-            self.state.progress.opacities_were_reset = true;
+            if let Some(opacity) = opacity_cap {
+                reset_opacities(&mut self.state.field.gaussians, opacity);
+                self.state.optimiser.of(&OPACITY_LOGITS).reset_all();
+                self.state.progress.opacities_were_reset = true;
+                capped = true;
+            }
         }
         if cloned + split + pruned > 0 {
             let gaussians = self.state.field.gaussians.len();
             events.push(TrainEvent::Densified { stage, iteration, cloned, split, pruned, gaussians });
         }
-        Ok(())
+        Ok(capped)
     }
 
     /// Replaces the set of Gaussians, and everything that has a row per Gaussian.
@@ -277,14 +273,14 @@ impl Trainer {
     fn instance_events(
         &mut self,
         iteration: u32,
-        due: &Due,
+        due: &[Due],
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
-        if due.estimates_identities {
+        if due.contains(&Due::EstimateIdentities) {
             let event = self.estimate_identities(false)?;
             events.push(event);
         }
-        if !due.resamples {
+        if !due.contains(&Due::Resample) {
             return Ok(());
         }
         let context = ResampleContext {

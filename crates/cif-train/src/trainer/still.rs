@@ -16,11 +16,11 @@ use super::Trainer;
 use super::changes::{Changes, Sight};
 use super::judged::gain;
 use super::motions::{Limits, Motion, accumulate, probe, probe_times, put_to_rest, restless, wake};
-use crate::config::EffectsConfig;
 use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
 use crate::random::{Purpose, stream};
+use crate::schedule::Due;
 use crate::stage::Stage;
 
 /// Motion, in limits, from which a Gaussian that stands still is handed back; more than 1, so that none goes back
@@ -31,21 +31,10 @@ const RELEASE: f32 = 2.0;
 /// stand still on the first test.
 const TOLD_LOSS: f64 = 0.1;
 
-/// Fewest steps of the fine stage for that, in steps before the first test: what settled too early needs time to
-/// recover.
-const TOLD_STEPS: f64 = 15.0;
-
 /// Rungs of the ladder of limits, each half of the one above.
 pub(super) const RUNGS: u32 = 3;
 
 impl Trainer {
-    /// True when Gaussians are tested after a step.
-    pub(super) fn settles(&self, stage: Stage, iteration: u32) -> bool {
-        let last = self.stages.iterations(&self.state.config, stage);
-        self.state.field.deformation.is_some()
-            && falls_due(&self.state.config.effects, self.first_test(), stage, iteration, last)
-    }
-
     /// The test for Gaussians that stand still, where it falls on this step: of a ladder of limits, the highest
     /// one counts that does not show in the held-out pixels. What the network moves again is handed back unless
     /// that shows; then only those watched are, of which the network says that they hardly move.
@@ -56,8 +45,8 @@ impl Trainer {
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
         let last = self.stages.iterations(&self.state.config, stage);
-        let due = self.settles(stage, iteration);
-        let Some(deformation) = self.state.field.deformation.as_ref().filter(|_| due) else { return Ok(()) };
+        let by_masks = self.moment(stage, iteration, self.state.progress.total_steps).has(Due::StillByMasks);
+        let Some(deformation) = &self.state.field.deformation else { return Ok(()) };
         let effects = &self.state.config.effects;
         let highest = Limits {
             displacement: effects.still_displacement * self.state.field.extent,
@@ -88,7 +77,7 @@ impl Trainer {
         let settings = self.state.color_settings();
         let mut error = self.judged_error(None, &settings)?;
         let mut settled = None;
-        if self.is_told(stage, iteration) {
+        if by_masks {
             let stands = |row: usize| !watched[row] && !travels[row];
             settled = self.try_to_settle(&motions, stands, &mut error, TOLD_LOSS)?;
         }
@@ -145,54 +134,6 @@ impl Trainer {
         Ok(Some(found))
     }
 
-    /// True when Gaussians will be tested on this step or a later one.
-    pub(super) fn tests_to_come(&self, stage: Stage, iteration: u32) -> bool {
-        let every = self.state.config.effects.still_every;
-        if every == 0 || !self.stages.is_dynamic {
-            return false;
-        }
-        let last = self.stages.iterations(&self.state.config, Stage::Fine);
-        match stage {
-            Stage::Coarse => true,
-            // The instance stage begins with a test; else the last one is in this stage.
-            Stage::Fine => {
-                self.stages.has_instances
-                    || (iteration..last).take(every as usize).any(|later| {
-                        falls_due(&self.state.config.effects, self.first_test(), stage, later, last)
-                    })
-                    || iteration < self.first_test()
-            }
-            _ => iteration <= 1,
-        }
-    }
-
-    /// Step of the fine stage on which the first test falls: its first, where images tell what moves.
-    fn first_test(&self) -> u32 {
-        if self.shows_changes {
-            return 1;
-        }
-        let fine_steps = f64::from(self.stages.iterations(&self.state.config, Stage::Fine));
-        let from = (f64::from(self.state.config.effects.still_from) * fine_steps).round() as u32;
-        let told = if self.knows_what_travels() { self.state.config.effects.still_told } else { from };
-        from.min(told).max(1)
-    }
-
-    /// True when masks tell on this step what stands still: on the first test, when the network has helped everything
-    /// into place and learnt little else that could be lost.
-    fn is_told(&self, stage: Stage, iteration: u32) -> bool {
-        let fine_steps = self.stages.iterations(&self.state.config, Stage::Fine);
-        stage == Stage::Fine
-            && iteration == self.first_test()
-            && TOLD_STEPS * f64::from(iteration) <= f64::from(fine_steps)
-            && !self.shows_changes
-            && self.knows_what_travels()
-    }
-
-    /// True when Gaussians of travelling objects are told from the others.
-    fn knows_what_travels(&self) -> bool {
-        self.state.guidance.knows_what_travels() || self.state.field.tracks.is_some()
-    }
-
     /// Change that cameras which stay in place see at the mean position of each Gaussian; empty without such cameras.
     fn sights(&mut self, motions: &[Motion]) -> Result<Vec<Sight>, TrainError> {
         if !self.shows_changes {
@@ -236,21 +177,6 @@ impl Trainer {
         {
             deformation.still[to as usize] = deformation.is_still(from as usize);
         }
-    }
-}
-
-/// True when a test falls on a step: at a share of the fine stage, then every so many steps, never at its end, where
-/// nothing is left to make good for it; and once more when the instance stage begins.
-fn falls_due(effects: &EffectsConfig, first_test: u32, stage: Stage, iteration: u32, last: u32) -> bool {
-    if effects.still_every == 0 || iteration >= last {
-        return false;
-    }
-    match stage {
-        Stage::Fine => {
-            iteration >= first_test && (iteration - first_test).is_multiple_of(effects.still_every)
-        }
-        Stage::Instance => iteration == 1,
-        _ => false,
     }
 }
 
@@ -298,20 +224,5 @@ mod tests {
         assert!(still > rows.len() / 2, "{still} of {}", rows.len());
         let after = trainer.judged_error(None, &settings).unwrap();
         assert!(gain(after, before) < 0.1, "{before} before, {after} after");
-    }
-
-    #[test]
-    fn tests_fall_after_the_warm_up_and_never_at_the_end() {
-        let effects = EffectsConfig { still_every: 50, still_from: 0.25, ..EffectsConfig::default() };
-        let due = |stage, last: u32| -> Vec<u32> {
-            let first_test = (0.25 * f64::from(last)).round() as u32;
-            (1..=last).filter(|step| falls_due(&effects, first_test, stage, *step, last)).collect()
-        };
-        assert_eq!(due(Stage::Fine, 200), [50, 100, 150]);
-        assert_eq!(due(Stage::Fine, 170), [43, 93, 143]);
-        assert_eq!(due(Stage::Instance, 101), [1]);
-        assert!(due(Stage::Coarse, 200).is_empty());
-        let never = EffectsConfig { still_every: 0, ..effects };
-        assert!(!falls_due(&never, 50, Stage::Fine, 50, 200));
     }
 }

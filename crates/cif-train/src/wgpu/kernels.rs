@@ -1,10 +1,9 @@
-//! The WGSL files of training: their bindings and entry points, and what they share with Rust.
+//! The WGSL files of training: their imports and entry points, and what they share with Rust.
 
 use cif_field::gaussians::SH_FLOATS;
 use cif_field::parameters::{OCCUPANCY_LOGITS, PLANES, Parameter, QUATERNIONS, TABLE};
 use cif_geometry::quaternion::MIN_NORM;
 use cif_render::constants::{MIN_LABEL_PROBABILITY, TILE};
-use cif_render::wgpu::Access::{Read, ReadWrite, Uniform};
 use cif_render::wgpu::deform::FIXED_POINT;
 use cif_render::wgpu::faults::FAULTS;
 use cif_render::wgpu::gaussians::{GEOMETRY_FLOATS, geometry_column};
@@ -333,7 +332,6 @@ pub const LOSSES: Module = Module {
     name: "losses",
     text: include_str!("losses.wgsl"),
     imports: &[CONSTANTS, LOSS_SETTINGS],
-    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
     entries: &["losses", "total"],
 };
 
@@ -342,7 +340,6 @@ pub const LEAVE_OUT: Module = Module {
     name: "leave_out",
     text: include_str!("leave_out.wgsl"),
     imports: &[CONSTANTS, LOSS_SETTINGS],
-    bindings: &[Uniform, Read, Read, ReadWrite],
     entries: &["leave_out"],
 };
 
@@ -351,7 +348,6 @@ pub const SSIM: Module = Module {
     name: "ssim",
     text: include_str!("ssim.wgsl"),
     imports: &[CONSTANTS, LOSS_SETTINGS],
-    bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
     entries: &["blur_rows", "compare", "blur_maps", "add_gradient"],
 };
 
@@ -360,7 +356,6 @@ pub const EXPOSURE: Module = Module {
     name: "exposure",
     text: include_str!("exposure.wgsl"),
     imports: &[CONSTANTS, FAULTS, EXPOSURE_SETTINGS],
-    bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
     entries: &["expose", "pull_back", "add_gradient"],
 };
 
@@ -369,7 +364,6 @@ pub const ADAM_EXPOSURES: Module = Module {
     name: "adam_exposures",
     text: include_str!("adam_exposures.wgsl"),
     imports: &[CONSTANTS, EXPOSURE_RATES, ADAM],
-    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
     entries: &["adam_exposures"],
 };
 
@@ -378,7 +372,6 @@ pub const ADAM_POSES: Module = Module {
     name: "adam_poses",
     text: include_str!("adam_poses.wgsl"),
     imports: &[CONSTANTS, GROUPS, QUATERNION_PRODUCTS, POSE_RATES],
-    bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
     entries: &["adam_poses", "hold_joints"],
 };
 
@@ -387,7 +380,6 @@ pub const ADAM_GAUSSIANS: Module = Module {
     name: "adam_gaussians",
     text: include_str!("adam_gaussians.wgsl"),
     imports: &[CONSTANTS, GAUSSIAN_RATES, ADAM],
-    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read, ReadWrite],
     entries: &["adam_geometry", "adam_sh"],
 };
 
@@ -396,7 +388,6 @@ pub const ADAM_NETWORK: Module = Module {
     name: "adam_network",
     text: include_str!("adam_network.wgsl"),
     imports: &[CONSTANTS, GROUP_RATES, ADAM],
-    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
     entries: &["adam_network"],
 };
 
@@ -405,7 +396,6 @@ pub const ADAM_PLANES: Module = Module {
     name: "adam_planes",
     text: include_str!("adam_planes.wgsl"),
     imports: &[CONSTANTS, PLANE_RATES, FIXED_POINT, ADAM],
-    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read],
     entries: &["adam_planes"],
 };
 
@@ -414,7 +404,6 @@ pub const ACCUMULATE: Module = Module {
     name: "accumulate",
     text: include_str!("accumulate.wgsl"),
     imports: &[CONSTANTS, ACCUMULATION, FAULTS],
-    bindings: &[Uniform, Read, ReadWrite, ReadWrite],
     entries: &["add", "add_screen", "add_statistics"],
 };
 
@@ -423,7 +412,6 @@ pub const REARRANGE: Module = Module {
     name: "rearrange",
     text: include_str!("rearrange.wgsl"),
     imports: &[CONSTANTS, REARRANGEMENT],
-    bindings: &[Uniform, Read, Read, ReadWrite],
     entries: &["rearrange"],
 };
 
@@ -432,7 +420,6 @@ pub const JUDGE: Module = Module {
     name: "judge",
     text: include_str!("judge.wgsl"),
     imports: &[CONSTANTS, FAULTS, JUDGEMENT],
-    bindings: &[Uniform, Read, Read, ReadWrite],
     entries: &["judge"],
 };
 
@@ -441,7 +428,6 @@ pub const IDENTITY: Module = Module {
     name: "identity",
     text: include_str!("identity.wgsl"),
     imports: &[CONSTANTS, ACCUMULATION],
-    bindings: &[Uniform, Read, Read, Read, ReadWrite],
     entries: &["identity"],
 };
 
@@ -450,7 +436,6 @@ pub const DISPLACEMENT: Module = Module {
     name: "displacement",
     text: include_str!("displacement.wgsl"),
     imports: &[CONSTANTS, MOTION],
-    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
     entries: &["follow", "displace"],
 };
 

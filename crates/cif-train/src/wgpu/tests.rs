@@ -22,7 +22,7 @@ use super::losses::{GpuLosses, GpuTarget, LossWeights, ViewLoss};
 use super::motion::GpuMotion;
 use super::optimiser::{GaussianStep, GpuMoments, GpuOptimiser, GroupStep, GroupSteps};
 use crate::adam::{Moments, PlaneWeights, RowRates, step_planes};
-use crate::densify::DensifyStatistics;
+use crate::density::DensifyStatistics;
 use crate::exposure::{Exposures, RATES, WIDTH};
 use crate::losses::displacement::{Pose, Pull, displacement_loss, rotations};
 use crate::losses::{SsimScratch, color_loss};

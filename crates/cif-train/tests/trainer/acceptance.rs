@@ -9,7 +9,7 @@ use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::{Channels, Gradients, InstanceSettings, RenderSettings};
 use cif_train::adam::{Moments, RowRates};
 use cif_train::config::{ResampleConfig, ScaleCorrection};
-use cif_train::resample::{Pair, Relocations, ResampleContext, apply, footprint_integral};
+use cif_train::density::relocate::{Pair, Relocations, ResampleContext, apply, footprint_integral};
 use glam::{DMat3, DVec2, DVec3};
 use rand::SeedableRng;
 

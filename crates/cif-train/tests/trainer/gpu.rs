@@ -242,6 +242,7 @@ fn effects_earn_their_place_on_the_same_steps_as_on_the_processor() {
 }
 
 #[test]
+#[ignore = "long: make test-long"]
 fn judged_runs_go_on_on_either_backend_and_end_the_same_on_a_gpu() {
     let Some(gpu) = testing::gpu() else { return };
     let folder = tempfile::tempdir().unwrap();

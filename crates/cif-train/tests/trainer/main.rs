@@ -6,6 +6,7 @@
 //! | `training`, `effects`, `guidance` | whole runs: quality, resuming, threads, what is skipped, what masks tell |
 //! | `acceptance` | identities and their resampling keep what they promise |
 //! | `from_scene` | instances on the reconstruction of another run |
+//! | `density` | densification rules declared by a test |
 //! | `heads` | a head declared by a test, on every engine |
 //! | `memory` | frames that do not fit into memory, read ahead |
 //! | `curve`, `pacing`, `measure` | error curves, budgets of time, measured steps |
@@ -16,6 +17,7 @@
 mod acceptance;
 mod compared_heads;
 mod curve;
+mod density;
 mod effects;
 mod from_scene;
 #[cfg(feature = "wgpu")]

@@ -8,6 +8,7 @@ use std::time::Duration;
 use cif_bench::device::{OnDevice, StageTimes};
 use cif_dataset::{Dataset, Layout};
 use cif_field::Field;
+use cif_geometry::stats::{median, median_of_sorted};
 #[cfg(feature = "wgpu")]
 use cif_render::wgpu::Gpu;
 use cif_train::metrics::training_config;
@@ -351,18 +352,7 @@ fn added_percent(pairs: impl Iterator<Item = (Duration, Duration)>) -> Option<f6
         (without > 0.0).then(|| 100.0 * (with.as_secs_f64() / without - 1.0))
     };
     let mut grown: Vec<f64> = pairs.filter_map(growth).collect();
-    grown.sort_by(f64::total_cmp);
-    median(&grown)
-}
-
-/// Median of ascending values.
-fn median(sorted: &[f64]) -> Option<f64> {
-    let middle = sorted.len() / 2;
-    match sorted.len() {
-        0 => None,
-        count if count % 2 == 1 => Some(sorted[middle]),
-        _ => Some((sorted[middle - 1] + sorted[middle]) / 2.0),
-    }
+    median(&mut grown)
 }
 
 /// Milliseconds per step.
@@ -374,7 +364,10 @@ struct Cost {
 fn cost(steps: &[StepTimes], of: impl Fn(&StepTimes) -> Duration) -> Cost {
     let mut ms: Vec<f64> = steps.iter().map(|step| 1e3 * of(step).as_secs_f64()).collect();
     ms.sort_by(f64::total_cmp);
-    Cost { mean: ms.iter().sum::<f64>() / ms.len().max(1) as f64, median: median(&ms).unwrap_or(0.0) }
+    Cost {
+        mean: ms.iter().sum::<f64>() / ms.len().max(1) as f64,
+        median: median_of_sorted(&ms).unwrap_or(0.0),
+    }
 }
 
 struct Report {

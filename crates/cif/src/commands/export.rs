@@ -15,7 +15,7 @@ use super::preset::{Preferred, Preset};
 use super::targets::{FILES, Targets, Writing};
 use super::{motion_table, scene};
 use crate::error::Error;
-use crate::formats::FORMATS;
+use crate::formats::{self, FORMATS};
 use crate::ground_truth::{self, MotionError};
 use crate::interrupt;
 use crate::messages::note;
@@ -143,7 +143,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     for target in command.targets.iter() {
         let other = target.format.rebuilt(&field, &graph, &options).map_err(Error::plain)?;
         let held = other.as_ref().unwrap_or(&graph);
-        let written = target.format.write(held, &target.path, &writing).map_err(Error::plain)?;
+        let written = formats::write(target.format, held, &target.path, &writing)?;
         target.tell(&written);
         if let Some(checker) = &checker {
             findings.push(checker.check(target, held, &writing)?);

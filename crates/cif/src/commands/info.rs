@@ -7,7 +7,7 @@ use cif_dataset::{Dataset, PointSource, Split};
 use cif_field::{Checkpoint, Field, Record};
 use cif_geometry::Bounds;
 use cif_scene::SceneOptions;
-use cif_scene::build::assignment::members;
+use cif_scene::from_field::assignment::members;
 use cif_train::Curve;
 use clap::Args;
 use glam::DVec3;

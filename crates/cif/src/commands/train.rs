@@ -10,6 +10,7 @@ use cif_train::{
     Control, EffectChoice, EffectPlan, HeadName, Outcome, Phase, Phases, Preset, Start, Stop, TrainConfig,
     TrainError, TrainEvent, Trainer,
 };
+use clap::builder::PossibleValue;
 use clap::{Args, ValueEnum};
 
 use super::train_budget::{Goals, Timing};
@@ -187,30 +188,33 @@ struct Settings {
     checkpoint_seconds: Option<u32>,
 }
 
-/// Heads by name.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub(super) enum HeadArgument {
-    Cif,
-    DrSplat,
-    GaussianGrouping,
-    Sa4d,
-    Vlgs,
-    Trace3d,
-    #[value(name = "4d-langsplat")]
-    LangSplat,
-}
+/// A head by its name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct HeadArgument(HeadName);
 
 impl HeadArgument {
-    pub(super) fn head(self) -> HeadName {
-        match self {
-            Self::Cif => HeadName::Cif,
-            Self::DrSplat => HeadName::DrSplat,
-            Self::GaussianGrouping => HeadName::GaussianGrouping,
-            Self::Sa4d => HeadName::Sa4d,
-            Self::Vlgs => HeadName::Vlgs,
-            Self::Trace3d => HeadName::Trace3d,
-            Self::LangSplat => HeadName::LangSplat,
+    const ALL: [Self; HeadName::ALL.len()] = {
+        let mut all = [Self(HeadName::Cif); HeadName::ALL.len()];
+        let mut k = 0;
+        while k < all.len() {
+            all[k] = Self(HeadName::ALL[k]);
+            k += 1;
         }
+        all
+    };
+
+    pub(super) fn head(self) -> HeadName {
+        self.0
+    }
+}
+
+impl ValueEnum for HeadArgument {
+    fn value_variants<'a>() -> &'a [Self] {
+        &Self::ALL
+    }
+
+    fn to_possible_value(&self) -> Option<PossibleValue> {
+        Some(PossibleValue::new(self.0.name()))
     }
 }
 

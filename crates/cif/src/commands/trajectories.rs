@@ -4,7 +4,7 @@ use cif_field::{Field, TrackGroup};
 use cif_geometry::PinholeCamera;
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_scene::SceneOptions;
-use cif_scene::build::assignment::members;
+use cif_scene::from_field::assignment::members;
 use glam::{DVec2, DVec3};
 
 use super::object_motion::followed;

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use cif_dataset::masks::flat_name;
+use cif_output::Workplace;
 use cif_vision::cache::{self, Cache};
 use cif_vision::grounding::Thresholds;
 use cif_vision::{Models, Prompter};
@@ -28,8 +29,14 @@ pub(super) fn detect(
     let thresholds = Thresholds::default();
     let pythons = cif_capture::structure::pythons();
     let mut prompter = Prompter::new(models, &pythons, thresholds);
-    let mut cache = Cache::new(place, models, prompt, thresholds)?;
     let mut folder = None;
+    // Masks that somebody else has put there are no answers of these models.
+    if let Err(error) = cif_output::private_folder(place) {
+        not_kept(&Error::io("use the cache", place)(error));
+        folder = Some(temporary()?);
+    }
+    let kept = folder.as_ref().map_or(place, Workplace::path);
+    let mut cache = Cache::new(kept, models, prompt, thresholds)?;
     let mut files = vec![Vec::new(); asked.dataset.frames.len()];
     let mut boxes = BTreeMap::new();
     let mut progress = FrameProgress::new(false, asked.frames.len());
@@ -43,10 +50,11 @@ pub(super) fn detect(
             None => {
                 let (mask, found) = prompter.mask(&picture, prompt)?;
                 if let Err(error) = cache::write(&file, &mask, &found) {
+                    let error = error.into();
                     if folder.is_some() {
-                        return Err(error.into());
+                        return Err(error);
                     }
-                    crate::messages::note!("{error}; masks are not kept for the next time, see --cache");
+                    not_kept(&error);
                     let instead = folder.insert(temporary()?);
                     cache = Cache::new(instead.path(), models, prompt, thresholds)?;
                     file = cache.file(&name, &picture);
@@ -60,4 +68,8 @@ pub(super) fn detect(
         progress.step();
     }
     Ok(Detected { masks: FoundMasks { files, loaded: true }, boxes, _folder: folder })
+}
+
+fn not_kept(error: &Error) {
+    crate::messages::note!("{error}; masks are not kept for the next time, see --cache");
 }

@@ -24,8 +24,7 @@ use super::faults::FAULTS;
 use super::gaussians::GpuGaussians;
 use super::rasterizer::PosedInput;
 use super::{
-    Access, Commands, Gpu, GpuError, GpuVec, Kernel, Layout, Module, Shared, Snippet, Uniform, structures,
-    workgroups,
+    Commands, Gpu, GpuError, GpuVec, Kernel, Layout, Module, Shared, Snippet, Uniform, structures, workgroups,
 };
 pub use moving::Moving;
 pub use shape::{Deformation, Layers, Moment, SPLITS, Shape};
@@ -44,15 +43,6 @@ const PREPARE: Module = Module {
     name: "deform_prepare",
     text: include_str!("deform_prepare.wgsl"),
     imports: &[MOMENT],
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::ReadWrite,
-        Access::ReadWrite,
-    ],
     entries: &["main"],
 };
 
@@ -60,17 +50,6 @@ const FORWARD: Module = Module {
     name: "deform",
     text: include_str!("deform.wgsl"),
     imports: &[DEFORMATION, MOMENT, HEXPLANE, NETWORK],
-    bindings: &[
-        Access::Uniform,
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::ReadWrite,
-        Access::ReadWrite,
-    ],
     entries: &["main"],
 };
 
@@ -78,17 +57,6 @@ const BACKWARD: Module = Module {
     name: "deform_backward",
     text: include_str!("deform_backward.wgsl"),
     imports: &[DEFORMATION, MOMENT, HEXPLANE, NETWORK],
-    bindings: &[
-        Access::Uniform,
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::ReadWrite,
-    ],
     entries: &["main"],
 };
 
@@ -96,7 +64,6 @@ const BACKWARD_WEIGHTS: Module = Module {
     name: "deform_backward_weights",
     text: include_str!("deform_backward_weights.wgsl"),
     imports: &[LAYERS, MOMENT, FAULTS],
-    bindings: &[Access::Uniform, Access::Uniform, Access::Read, Access::ReadWrite, Access::ReadWrite],
     entries: &["main"],
 };
 
@@ -104,18 +71,6 @@ const PLANES_BACKWARD: Module = Module {
     name: "deform_planes_backward",
     text: include_str!("deform_planes_backward.wgsl"),
     imports: &[DEFORMATION, MOMENT, HEXPLANE, FIXED_POINT, FAULTS],
-    bindings: &[
-        Access::Uniform,
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::ReadWrite,
-        Access::ReadWrite,
-        Access::ReadWrite,
-    ],
     entries: &["main"],
 };
 
@@ -123,7 +78,6 @@ const LINES_BACKWARD: Module = Module {
     name: "deform_lines_backward",
     text: include_str!("deform_lines_backward.wgsl"),
     imports: &[MOMENT, FIXED_POINT],
-    bindings: &[Access::Uniform, Access::Read, Access::ReadWrite, Access::ReadWrite],
     entries: &["main"],
 };
 
@@ -131,15 +85,6 @@ const MOVING_ROWS: Module = Module {
     name: "deform_moving",
     text: include_str!("deform_moving.wgsl"),
     imports: &[MOVING, FAULTS],
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::ReadWrite,
-        Access::Read,
-        Access::ReadWrite,
-    ],
     entries: &["take", "put", "put_gradients"],
 };
 

@@ -23,8 +23,8 @@ use super::rasterizer::{PosedInput, Rasterizer};
 use super::stages::entries;
 use super::view::{CONSTANTS, NUMBERS};
 use super::{
-    Access, Commands, Gpu, GpuError, GpuVec, Kernel, Layout, MAX_WORKGROUPS, Module, Shared, Snippet,
-    Uniform, constants, structures, workgroups,
+    Commands, Gpu, GpuError, GpuVec, Kernel, Layout, MAX_WORKGROUPS, Module, Shared, Snippet, Uniform,
+    constants, structures, workgroups,
 };
 
 crate::shared_struct! {
@@ -119,16 +119,6 @@ pub const POSES: Module = Module {
     name: "poses",
     text: include_str!("poses.wgsl"),
     imports: &[CONSTANTS, NUMBERS, GROUPS, QUATERNIONS],
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::ReadWrite,
-        Access::ReadWrite,
-        Access::ReadWrite,
-    ],
     entries: &["frames_of_groups", "carry"],
 };
 
@@ -137,15 +127,6 @@ pub const POSES_BACKWARD: Module = Module {
     name: "poses_backward",
     text: include_str!("poses_backward.wgsl"),
     imports: &[CONSTANTS, GROUPS, QUATERNIONS],
-    bindings: &[
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::ReadWrite,
-        Access::ReadWrite,
-    ],
     entries: &["poses_backward"],
 };
 
@@ -154,14 +135,6 @@ pub const POSES_SUM: Module = Module {
     name: "poses_sum",
     text: include_str!("poses_sum.wgsl"),
     imports: &[CONSTANTS, NUMBERS, GROUPS, FAULTS],
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::ReadWrite,
-        Access::ReadWrite,
-    ],
     entries: &["poses_sum"],
 };
 

@@ -10,7 +10,7 @@ use cif_render::wgpu::{
 };
 
 use crate::adam::Moments;
-use crate::densify::DensifyStatistics;
+use crate::density::DensifyStatistics;
 use crate::error::TrainError;
 use crate::optimiser::Optimiser;
 use crate::state::State;

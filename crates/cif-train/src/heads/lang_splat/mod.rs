@@ -21,11 +21,9 @@ pub mod relevance;
 
 use cif_field::Field;
 use cif_field::parameters::Parameter;
-use cif_render::Blending;
 
 use super::tensors::per_gaussian;
-use super::{Head, HeadLoss, HeadTensors, HeadValues, HeadView, Pass, Target, ValueHead};
-use crate::config::TrainConfig;
+use super::{HeadLoss, HeadTensors, HeadView, Target, ValueHead};
 
 /// Channels of a code.
 const CODE: usize = 3;
@@ -42,16 +40,6 @@ const CODES: Parameter = per_gaussian("lang_splat", "codes", &[CODE]);
 /// Language channels per Gaussian.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct LangSplat;
-
-impl Head for LangSplat {
-    fn name(&self) -> &'static str {
-        "4d-langsplat"
-    }
-
-    fn pass(&self, _config: &TrainConfig) -> Pass<'_> {
-        Pass::Values(self)
-    }
-}
 
 impl ValueHead for LangSplat {
     fn target(&self) -> Target {
@@ -70,20 +58,8 @@ impl ValueHead for LangSplat {
         RATE
     }
 
-    fn channels(&self, _field: &Field) -> usize {
-        CODE
-    }
-
-    fn blending(&self) -> Blending {
-        Blending::Color
-    }
-
-    fn values(&self, tensors: &HeadTensors, _field: &Field, _time: f64) -> Vec<f32> {
-        tensors.values(&CODES).to_vec()
-    }
-
-    fn values_backward(&self, tensors: &mut HeadTensors, _: &Field, _: &HeadValues, v_values: &[f32]) {
-        tensors.add_gradients(&CODES, v_values);
+    fn codes(&self) -> Parameter {
+        CODES
     }
 
     fn loss(

@@ -18,14 +18,12 @@ mod network;
 
 use cif_field::Field;
 use cif_field::parameters::Parameter;
-use cif_render::Blending;
 
 pub(super) use self::network::Layers;
 use self::network::{CODE, Network};
 use super::classifier::{Classifier, biases, neighbours, weights};
 use super::tensors::shared;
-use super::{Head, HeadLoss, HeadStep, HeadTensors, HeadValues, HeadView, Pass, ValueHead, largest};
-use crate::config::TrainConfig;
+use super::{HeadLoss, HeadStep, HeadTensors, HeadValues, HeadView, ValueHead, largest};
 
 /// Rate of network and classifier.
 const RATE: f32 = 5e-4;
@@ -61,16 +59,6 @@ impl Sa4d {
     }
 }
 
-impl Head for Sa4d {
-    fn name(&self) -> &'static str {
-        "sa4d"
-    }
-
-    fn pass(&self, _config: &TrainConfig) -> Pass<'_> {
-        Pass::Values(self)
-    }
-}
-
 impl ValueHead for Sa4d {
     fn parameters(&self) -> Vec<Parameter> {
         vec![NETWORK, CLASSIFIER.weights, CLASSIFIER.biases]
@@ -90,10 +78,6 @@ impl ValueHead for Sa4d {
 
     fn channels(&self, _field: &Field) -> usize {
         CODE
-    }
-
-    fn blending(&self) -> Blending {
-        Blending::Color
     }
 
     fn values(&self, tensors: &HeadTensors, field: &Field, time: f64) -> Vec<f32> {

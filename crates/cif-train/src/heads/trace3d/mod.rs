@@ -22,7 +22,6 @@ mod contrast;
 
 use cif_field::Field;
 use cif_field::parameters::Parameter;
-use cif_render::Blending;
 use cif_render::cpu::{ContributorMass, ContributorRule};
 use fearless_simd::Level;
 use rand::seq::index::sample;
@@ -31,9 +30,9 @@ use rand_pcg::Pcg64;
 
 use self::contrast::{CODE, contrast};
 use super::tensors::{per_gaussian, shared};
-use super::{Head, HeadLoss, HeadTensors, HeadValues, HeadView, Pass, Phase, TrainingViews, ValueHead};
-use crate::config::{HeadName, TrainConfig};
-use crate::densify::{Rearrangement, keep, with_copies};
+use super::{HeadLoss, HeadTensors, HeadView, Phase, TrainingViews, ValueHead};
+use crate::config::HeadName;
+use crate::density::{Rearrangement, keep, with_copies};
 use crate::error::TrainError;
 use crate::random::{Purpose, stream};
 
@@ -135,16 +134,6 @@ fn trace(views: &mut TrainingViews<'_>, each: &mut Traced<'_>) -> Result<(), Tra
     })
 }
 
-impl Head for Trace3d {
-    fn name(&self) -> &'static str {
-        "trace3d"
-    }
-
-    fn pass(&self, _config: &TrainConfig) -> Pass<'_> {
-        Pass::Values(self)
-    }
-}
-
 impl ValueHead for Trace3d {
     fn parameters(&self) -> Vec<Parameter> {
         vec![CODES, CENTROIDS, KNOWN]
@@ -166,20 +155,8 @@ impl ValueHead for Trace3d {
         if step <= scaled(COLOR_STEPS, steps) { Phase::Field } else { Phase::Head }
     }
 
-    fn channels(&self, _field: &Field) -> usize {
-        CODE
-    }
-
-    fn blending(&self) -> Blending {
-        Blending::Color
-    }
-
-    fn values(&self, tensors: &HeadTensors, _field: &Field, _time: f64) -> Vec<f32> {
-        tensors.values(&CODES).to_vec()
-    }
-
-    fn values_backward(&self, tensors: &mut HeadTensors, _: &Field, _: &HeadValues, v_values: &[f32]) {
-        tensors.add_gradients(&CODES, v_values);
+    fn codes(&self) -> Parameter {
+        CODES
     }
 
     fn loss(

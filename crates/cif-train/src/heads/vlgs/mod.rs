@@ -26,8 +26,7 @@ use rand_distr::{Distribution, StandardNormal};
 use self::attention::{LANGUAGE, TOKENS};
 use super::classifier::{Classifier, biases, weights};
 use super::tensors::{per_gaussian, shared};
-use super::{CameraBlending, Head, HeadLoss, HeadTensors, HeadValues, HeadView, OwnOpacity, Pass, ValueHead};
-use crate::config::TrainConfig;
+use super::{CameraBlending, HeadLoss, HeadTensors, HeadValues, HeadView, OwnOpacity, ValueHead};
 use crate::random::{Purpose, stream};
 
 /// Standard deviation of language channels at the start.
@@ -64,16 +63,6 @@ fn channels(field: &Field, codes: &[f32], row: usize) -> [f32; TOKENS] {
         None => 0.5 + BAND_0 as f32 * color[k],
         Some(k) => codes[row * LANGUAGE + k],
     })
-}
-
-impl Head for Vlgs {
-    fn name(&self) -> &'static str {
-        "vlgs"
-    }
-
-    fn pass(&self, _config: &TrainConfig) -> Pass<'_> {
-        Pass::Values(self)
-    }
 }
 
 impl ValueHead for Vlgs {

@@ -96,6 +96,7 @@ fn the_lid_of_a_box_turns_on_its_hinge() {
 }
 
 #[test]
+#[ignore = "long: make test-long"]
 fn a_drawer_slides() {
     let base = faces(DVec3::new(-0.07, -0.04, 0.0), DVec3::new(0.07, 0.06, 0.08), 1200, 22);
     let drawer = faces(DVec3::new(-0.06, -0.055, 0.01), DVec3::new(0.06, 0.03, 0.07), 900, 23);
@@ -108,6 +109,7 @@ fn a_drawer_slides() {
 }
 
 #[test]
+#[ignore = "long: make test-long"]
 fn a_box_that_rests_has_no_part() {
     let places = faces(DVec3::new(-0.07, -0.05, 0.0), DVec3::new(0.07, 0.05, 0.08), 1500, 24);
     let (base, rest) = places.split_at(1000);

@@ -271,7 +271,7 @@ fn contenders(command: &BenchCompare, has_maps: bool) -> Result<Vec<Contender>, 
         false => is_named(*head),
     };
     let mut contenders: Vec<Contender> =
-        HeadName::ALL.into_iter().filter(wanted).map(Contender::Head).collect();
+        HeadName::ALL.iter().copied().filter(wanted).map(Contender::Head).collect();
     if command.ablations {
         let whole = Contender::Head(HeadName::Cif);
         if !contenders.contains(&whole) {

@@ -188,7 +188,7 @@ fn encode(
         let words = String::from_utf8_lossy(&ended.stderr);
         return Err(failed(words.lines().last().unwrap_or("it gave no reason")));
     }
-    scratch.replace(&[(partial, file.to_owned())], None).map_err(Error::io("write", file))
+    scratch.replace(&[(partial, file.to_owned())], &[]).map_err(Error::io("write", file))
 }
 
 /// An encoder that takes pictures of one size, rows of 8-bit colours, on its standard input.

@@ -25,6 +25,7 @@
 //! Without identities everything is background.
 
 use cif_field::{Field, Owner};
+use cif_geometry::scalar::direct_sigmoid;
 use cif_geometry::{Bounds, overlap};
 use glam::DVec3;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
@@ -158,7 +159,7 @@ fn needed_shares(field: &Field, visible: &[u32], candidates: &[Option<Identity>]
 /// Occupancies of the visible rows, or opacities where occupancy tells nothing.
 fn occupancies(field: &Field, visible: &[u32]) -> Vec<f32> {
     let sigmoid_of = |logits: &[f32]| -> Vec<f32> {
-        visible.iter().map(|&row| 1.0 / (1.0 + (-logits[row as usize]).exp())).collect()
+        visible.iter().map(|&row| direct_sigmoid(logits[row as usize])).collect()
     };
     let occupancy = sigmoid_of(&field.gaussians.occupancy_logits);
     let lowest = occupancy.iter().copied().fold(f32::INFINITY, f32::min);

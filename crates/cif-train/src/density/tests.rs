@@ -1,5 +1,9 @@
 use rand::SeedableRng;
 
+use cif_render::Gradients;
+use rand_distr::{Distribution, StandardNormal};
+
+use super::super::rearrangement::in_world;
 use super::*;
 
 const EXTENT: f32 = 1.0;

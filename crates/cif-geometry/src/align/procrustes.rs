@@ -1,8 +1,10 @@
 //! Robust rigid alignment of two point sets (Kabsch 1976, iteratively re-weighted).
 
-use cif_geometry::RigidTransform;
 use glam::{DMat3, DVec3};
 use nalgebra::Matrix3;
+
+use crate::RigidTransform;
+use crate::stats::weighted_quantile;
 
 /// Re-weighting rounds at most.
 const ROUNDS: usize = 40;
@@ -42,7 +44,8 @@ pub fn weighted_procrustes(
 }
 
 /// The rotation nearest to a matrix, in the Frobenius norm; `None` where the matrix fixes none.
-pub(crate) fn polar_rotation(matrix: &DMat3) -> Option<DMat3> {
+#[must_use]
+pub fn polar_rotation(matrix: &DMat3) -> Option<DMat3> {
     rotation_of(&matrix.transpose())
 }
 
@@ -117,22 +120,6 @@ pub fn residuals(fit: &RigidTransform, source: &[DVec3], target: &[DVec3]) -> Ve
     source.iter().zip(target).map(|(s, t)| (*t - fit.apply(*s)).length()).collect()
 }
 
-/// Smallest value below which at least `quantile` of the weight lies; 0 without weight.
-#[must_use]
-pub fn weighted_quantile(values: &[f64], weights: &[f64], quantile: f64) -> f64 {
-    let mut order: Vec<u32> = (0..values.len() as u32).collect();
-    order.sort_unstable_by(|&a, &b| values[a as usize].total_cmp(&values[b as usize]).then(a.cmp(&b)));
-    let wanted = quantile * weights.iter().sum::<f64>();
-    let mut sum = 0.0;
-    for index in order {
-        sum += weights[index as usize];
-        if sum >= wanted && sum > 0.0 {
-            return values[index as usize];
-        }
-    }
-    0.0
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -204,12 +191,5 @@ mod tests {
         let source = cloud(3);
         let fit = robust_procrustes(&source, &source, &[0.0; 3], motion());
         assert_eq!(fit, motion());
-    }
-
-    #[test]
-    fn quantiles_follow_the_weights() {
-        assert_eq!(weighted_quantile(&[3.0, 1.0, 2.0], &[1.0, 1.0, 8.0], 0.5), 2.0);
-        assert_eq!(weighted_quantile(&[3.0, 1.0, 2.0], &[1.0, 1.0, 8.0], 1.0), 3.0);
-        assert_eq!(weighted_quantile(&[], &[], 0.5), 0.0);
     }
 }

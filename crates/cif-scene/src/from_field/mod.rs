@@ -11,15 +11,16 @@ use std::collections::BTreeSet;
 
 use cif_field::{Field, Gaussians};
 use cif_geometry::quaternion;
+use cif_geometry::scalar::direct_sigmoid;
 use glam::DVec3;
 
 use crate::appearance::blur::Blur;
 use crate::appearance::visibility;
 use crate::appearance::{self, Opacities, Thinning};
-use crate::build::assignment::Identity;
-use crate::build::frames::{Frame, Frames};
-use crate::build::node::{Naming, NodeInput};
-use crate::build::source::FieldMotion;
+use crate::from_field::assignment::Identity;
+use crate::from_field::frames::{Frame, Frames};
+use crate::from_field::node::{Naming, NodeInput};
+use crate::from_field::source::FieldMotion;
 use crate::graph::{Node, NodeKind, Origin, SceneGraph, TimeCodes};
 use crate::joint::{ToldParts, jointed_groups};
 use crate::motion::choose::{self, Chosen};
@@ -245,10 +246,6 @@ fn sampled_frames(field: &Field, options: &SceneOptions) -> Result<Vec<usize>, S
     Ok(frames)
 }
 
-pub(crate) fn sigmoid(logit: f32) -> f32 {
-    1.0 / (1.0 + (-logit).exp())
-}
-
 /// Rows that can be drawn at any time, ascending.
 fn visible_rows(
     gaussians: &Gaussians,
@@ -266,7 +263,7 @@ fn visible_rows(
                 && quaternion::try_normalize(gaussians.quaternions[row]).is_some()
                 && !gaussians.opacity_logits[row].is_nan();
             let drawn = opacities[row] >= options.min_opacity
-                && sigmoid(gaussians.occupancy_logits[row]) >= options.min_occupancy;
+                && direct_sigmoid(gaussians.occupancy_logits[row]) >= options.min_occupancy;
             invalid += usize::from(!usable);
             invisible += usize::from(usable && !drawn);
             usable && drawn

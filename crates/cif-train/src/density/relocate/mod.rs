@@ -13,7 +13,7 @@ pub use conserve::{conserved_logit, footprint_integral, scale_correction};
 pub use draw::{draw_with_replacement, draw_without_replacement, limited_shares, shares};
 
 use crate::config::{Excess, LabelShares, ResampleConfig, ScaleCorrection, WeakSet, Weakness};
-use crate::densify::in_world;
+use crate::density::rearrangement::in_world;
 use crate::estimate::most_probable;
 
 /// Inputs of a resampling event beside the field.

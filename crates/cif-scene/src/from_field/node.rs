@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 
 use cif_field::{Embedding, Field, Gaussians, Identities, RotationEvidence};
 use cif_geometry::RigidTransform;
+use cif_geometry::scalar::direct_sigmoid;
 use glam::DVec3;
 
-use crate::build::assignment::Identity;
-use crate::build::frames::Frames;
-use crate::build::sigmoid;
+use crate::from_field::assignment::Identity;
+use crate::from_field::frames::Frames;
 use crate::graph::{
     Appearance, DenseMotion, IdentityShare, IdentityShares, Motion, Node, NodeKind, Part, PartsMotion,
     SHARES_PER_SPLAT, Splats,
@@ -174,9 +174,9 @@ fn appearance(input: &NodeInput<'_>, is_instance: bool, rows: Vec<u32>) -> Splat
     let mut splats = Splats { sh_degree: degree, ..Splats::default() };
     for &row in &rows {
         let row = row as usize;
-        splats.opacities.push(sigmoid(gaussians.opacity_logits[row]));
+        splats.opacities.push(direct_sigmoid(gaussians.opacity_logits[row]));
         splats.sh_coefficients.extend_from_slice(&gaussians.sh_coefficients[row][..floats]);
-        splats.occupancies.push(sigmoid(gaussians.occupancy_logits[row]));
+        splats.occupancies.push(direct_sigmoid(gaussians.occupancy_logits[row]));
         let probability = input.identities[row].map_or(0.0, |identity| identity.probability);
         splats.identity_probabilities.push(if is_instance { probability } else { 0.0 });
     }

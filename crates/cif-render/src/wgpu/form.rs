@@ -1,0 +1,88 @@
+//! The two forms of what the invocations of a workgroup do together: through workgroup memory, which every device has,
+//! and by subgroups. A module imports `workgroup`, pastes `lane_builtins` into the parameters of its entry points and
+//! `lane` at their start; which form it gets is the device's.
+
+use super::snippet::Snippet;
+
+/// Means by which the invocations of a workgroup cooperate.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Form {
+    /// Through workgroup memory.
+    #[default]
+    Portable,
+    /// By subgroups.
+    Subgroups,
+}
+
+impl Form {
+    /// Both.
+    pub const ALL: [Self; 2] = [Self::Portable, Self::Subgroups];
+
+    /// Snippets that modules import as `workgroup`, `lane_builtins` and `lane`.
+    ///
+    /// Subgroup built-ins are parameters and no members of a structure, for naga 30 misses those in HLSL; and it
+    /// takes no `enable subgroups;`.
+    #[must_use]
+    pub fn snippets(self) -> &'static [Snippet; 3] {
+        match self {
+            Self::Portable => &[
+                Snippet { name: "workgroup", text: || include_str!("shared/workgroup.wgsl").to_owned() },
+                Snippet {
+                    name: "lane_builtins",
+                    text: || "@builtin(local_invocation_index) local: u32,".to_owned(),
+                },
+                Snippet { name: "lane", text: || "let lane = Lane(local);".to_owned() },
+            ],
+            Self::Subgroups => &[
+                Snippet {
+                    name: "workgroup",
+                    text: || include_str!("shared/workgroup_by_subgroups.wgsl").to_owned(),
+                },
+                Snippet {
+                    name: "lane_builtins",
+                    text: || {
+                        "@builtin(local_invocation_index) local: u32,\n\
+                         @builtin(subgroup_id) subgroup: u32,\n\
+                         @builtin(num_subgroups) subgroups: u32,"
+                            .to_owned()
+                    },
+                },
+                Snippet {
+                    name: "lane",
+                    text: || {
+                        "let lane = Lane(local, subgroup, subgroups, subgroupExclusiveAdd(1u));".to_owned()
+                    },
+                },
+            ],
+        }
+    }
+}
+
+/// Use of subgroups on a device, or the reason against it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum SubgroupUse {
+    /// It does, and known numbers came out right.
+    Used,
+    /// The adapter has none.
+    Missing,
+    /// `CIF_GPU_FEATURES` does not name them.
+    HeldBack,
+    /// Software stands in for a GPU, and loops over them.
+    Software,
+    /// Known numbers came out wrong: what did.
+    Wrong(String),
+}
+
+impl std::fmt::Display for SubgroupUse {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Used => f.write_str("used for sums over workgroups, after known numbers came out right"),
+            Self::Missing => f.write_str("not there, sums go through workgroup memory"),
+            Self::HeldBack => f.write_str("not used, as CIF_GPU_FEATURES says"),
+            Self::Software => f.write_str(
+                "not used, because software loops over them (CIF_GPU_FEATURES=all uses them all the same)",
+            ),
+            Self::Wrong(what) => write!(f, "not used, because this driver does not get them right: {what}"),
+        }
+    }
+}

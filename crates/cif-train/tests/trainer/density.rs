@@ -1,0 +1,102 @@
+//! Densification rules that are declared here alone.
+
+use std::sync::Arc;
+
+use crate::support::{Scene, capture, small_config};
+use cif_train::density::{Change, Rows, Strategy, keep, with_copies};
+use cif_train::schedule::Moment;
+use cif_train::{Control, Outcome, Stage, TrainConfig, TrainEvent, Trainer};
+use rand_pcg::Pcg64;
+
+/// Step of the fine stage behind which the set changes.
+const STEP: u32 = 7;
+
+/// Doubles all Gaussians behind one step, then keeps every fourth of them, and caps opacities.
+struct DoubleThenThin;
+
+impl Strategy for DoubleThenThin {
+    fn counts_statistics(&self, _step: &Moment<'_>) -> bool {
+        false
+    }
+
+    fn changes(&self, step: &Moment<'_>) -> usize {
+        if step.stage == Stage::Fine && step.iteration == STEP { 2 } else { 0 }
+    }
+
+    fn change(&self, k: usize, _step: &Moment<'_>, rows: &Rows<'_>, rng: &mut Pcg64) -> Change {
+        let all: Vec<u32> = (0..rows.gaussians.len() as u32).collect();
+        assert_eq!(rows.statistics.count, vec![0; all.len()], "nothing was counted");
+        match k {
+            0 => Change {
+                rearrangement: Some(with_copies(rows.gaussians, &all, &[], rng)),
+                ..Change::default()
+            },
+            _ => Change {
+                rearrangement: keep(rows.gaussians, all.into_iter().step_by(4).collect()),
+                opacity_cap: Some(0.01),
+                ..Change::default()
+            },
+        }
+    }
+}
+
+/// Settings of a run of a few steps.
+fn config() -> TrainConfig {
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (10, 20, 10);
+    config.stages.fine_includes_coarse = false;
+    (config.motion.guidance, config.motion.stillness) = (0.0, 0.0);
+    config
+}
+
+/// Changes of the set in the coarse and fine stage: step, cloned, pruned and Gaussians left.
+fn run(trainer: &mut Trainer, stop_behind: Option<u64>) -> Vec<(Stage, u32, usize, usize, usize)> {
+    let mut found = Vec::new();
+    let outcome = trainer
+        .run(&mut |event, _view| {
+            if let TrainEvent::Densified { stage, iteration, cloned, pruned, gaussians, .. } = *event {
+                found.push((stage, iteration, cloned, pruned, gaussians));
+            }
+            match event {
+                TrainEvent::Step { stage: Stage::Fine, iteration, .. }
+                    if Some(u64::from(*iteration)) == stop_behind =>
+                {
+                    Control::Stop
+                }
+                _ => Control::Continue,
+            }
+        })
+        .unwrap();
+    assert_eq!(outcome == Outcome::Interrupted, stop_behind.is_some());
+    found
+}
+
+#[test]
+fn a_strategy_that_is_declared_here_changes_the_set_on_its_steps_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene::default());
+    let mut trainer = Trainer::new(dataset.clone(), config()).unwrap();
+    trainer.set_density(Arc::new(DoubleThenThin));
+    let before = trainer.field().len();
+    let found = run(&mut trainer, None);
+    let left = (2 * before).div_ceil(4);
+    assert_eq!(found, [(Stage::Fine, STEP, before, 2 * before - left, left)]);
+    assert_eq!(trainer.field().len(), left);
+    trainer.field().validate().unwrap();
+
+    // Today's rules do something else.
+    let mut usual = Trainer::new(dataset.clone(), config()).unwrap();
+    run(&mut usual, None);
+    assert_ne!(usual.field().len(), left);
+
+    // A resumed run that is given the strategy again ends where the other did.
+    let mut config = config();
+    config.report.step_every = 1;
+    let mut interrupted = Trainer::new(dataset.clone(), config).unwrap();
+    interrupted.set_density(Arc::new(DoubleThenThin));
+    assert!(run(&mut interrupted, Some(u64::from(STEP) - 2)).is_empty());
+    let mut resumed = Trainer::resume(dataset, interrupted.checkpoint(true)).unwrap();
+    resumed.set_density(Arc::new(DoubleThenThin));
+    run(&mut resumed, None);
+    assert_eq!(resumed.field().gaussians, trainer.field().gaussians);
+}
