@@ -33,7 +33,7 @@ BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13 b
 # One interpreter for every build, or PyO3 is built again.
 export PYO3_PYTHON := $(abspath $(BIN)/python)
 
-.PHONY: help build wheel demo plugin stubs test test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-blender test-capture fuzz lint format clean
+.PHONY: help build wheel demo plugin stubs docs test test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-blender test-capture fuzz lint format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
@@ -47,6 +47,7 @@ help:
 	@echo "make test-validator   NVIDIA's validator on our stages, which is downloaded (50 MB)"
 	@echo "make test-capture   tests of cif capture with pycolmap, which is downloaded (50 MB), and ffmpeg where it is there"
 	@echo "make stubs   docstrings of the Python module into its stub"
+	@echo "make docs    the pages of docs/reference, generated from the code"
 	@echo "make lint    formatting and lints, as in CI"
 	@echo "make format  put the formatting right"
 
@@ -113,7 +114,10 @@ test-wheel: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 # What cif-usd writes and reads is tested in a Python that has usd-core. Long tests are whole fits of objects and runs that
 # others cover in part; `make test-long` runs them.
 test-long: SELECTION := -- --ignored
-test-rust test-long: test-wheel
+# The tests that compare docs/reference with the code write it instead.
+docs: SELECTION := --test across reference::
+docs: export CIF_WRITE_DOCS := 1
+test-rust test-long docs: test-wheel
 	PYTHONPATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))') \
 	LD_LIBRARY_PATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_config_var("LIBDIR"))') \
 	cargo test --locked --no-fail-fast --features cif-usd/python,cif-vision/onnx $(SELECTION)
