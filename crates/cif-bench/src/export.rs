@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use cif_field::Field;
-use cif_scene::report::ReportRow;
+use cif_scene::graph::ReportRow;
 use cif_scene::{ExportOptions, MotionModel, SceneFormat, SceneGraph, SceneOptions, Tolerance};
 use serde::Serialize;
 

@@ -1,5 +1,7 @@
 //! Errors of building a scene.
 
+use crate::graph::OptionError;
+
 /// Why a field cannot become a scene.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -65,13 +67,6 @@ pub enum SceneError {
         base: String,
     },
     /// An option outside its range.
-    #[error("{option} is {value}, but must be {expected}")]
-    Option {
-        /// Name of the option.
-        option: &'static str,
-        /// Given value.
-        value: String,
-        /// Allowed values.
-        expected: &'static str,
-    },
+    #[error(transparent)]
+    Option(#[from] OptionError),
 }

@@ -8,8 +8,8 @@ use cif_field::Field;
 use serde::Deserialize;
 
 use crate::{
-    CodeRange, DENSITY, LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, QueryError,
-    SceneError, SceneGraph, SceneOptions, UpAxis, build, query, search,
+    CodeRange, DENSITY, LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, OptionError,
+    QueryError, SceneError, SceneGraph, SceneOptions, UpAxis, build, query, search,
 };
 
 /// Why a format refuses; the message names the file and what to do.
@@ -218,15 +218,15 @@ pub enum Ground {
 }
 
 impl FromStr for Ground {
-    type Err = SceneError;
+    type Err = OptionError;
 
     /// `none`, `auto`, or a height such as `-0.02`.
-    fn from_str(text: &str) -> Result<Self, SceneError> {
+    fn from_str(text: &str) -> Result<Self, OptionError> {
         match (text, text.parse::<f64>()) {
             ("none", _) => Ok(Self::None),
             ("auto", _) => Ok(Self::Auto),
             (_, Ok(height)) if height.is_finite() => Ok(Self::At(height)),
-            _ => Err(SceneError::Option {
+            _ => Err(OptionError {
                 option: "ground",
                 value: text.to_owned(),
                 expected: "none, auto or a height in world units",

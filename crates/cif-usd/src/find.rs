@@ -12,11 +12,8 @@ use pyo3::prelude::*;
 use crate::pxr::{self, Pxr, reason};
 use crate::read::labels::{DirectLabels, all_prims};
 use crate::read::open::open_for_labels;
-use crate::read::query::drawn;
+use crate::read::query::{USE_EXTENTS_HINTS, drawn};
 use crate::{ReadOptions, UsdError, conventions, tokens};
-
-/// Boxes are those that models give of themselves, where they do: of what can be seen.
-pub(crate) const USE_EXTENTS_HINTS: bool = true;
 
 pub(crate) fn search(
     path: &Path,

@@ -14,7 +14,7 @@ use cif_geometry::spherical_harmonics::{HarmonicsRotation, coefficient_count};
 use glam::DQuat;
 use rayon::prelude::*;
 
-use crate::from_field::frames::Frames;
+use crate::field_motion::frames::Frames;
 use crate::graph::{Appearance, AppearanceSample, Motion, is_visible_at, pose_at};
 use crate::motion::keys;
 use crate::{Node, VisibilitySample};
@@ -116,7 +116,7 @@ pub(crate) fn recolor(node: &mut Node, frames: &mut Frames<'_>, thinning: &Thinn
             let mut values = vec![0.0; floats * node.splats.len()];
             for (range, rotation) in turns(node, time_code) {
                 let back = (rotation.xyz().length() > 1e-9)
-                    .then(|| HarmonicsRotation::<f32>::new(crate::to_field::rows_of(rotation.conjugate())));
+                    .then(|| HarmonicsRotation::<f32>::new(crate::vectors::rows_of(rotation.conjugate())));
                 let rows = &node.splats.rows[range.clone()];
                 let values = &mut values[range.start * floats..range.end * floats];
                 values.par_chunks_exact_mut(floats).zip(rows).for_each(|(values, row)| {

@@ -5,10 +5,10 @@ use cif_geometry::{Bounds, RigidTransform};
 use glam::DAffine3;
 
 use super::{Bake, Piece, Placement, Prim, Shape, Track};
+use crate::graph::MotionReport;
 use crate::graph::{
     Appearance, AppearanceSample, DenseMotion, DenseSample, Motion, Node, NodeKind, Part, PartsMotion, Splats,
 };
-use crate::report::MotionReport;
 use crate::shape::extent;
 use crate::{PoseSample, naming};
 

@@ -1,8 +1,11 @@
+use std::collections::BTreeMap;
+
 use glam::{DAffine3, DQuat, DVec3};
 
 use super::*;
-use crate::graph::Part;
-use crate::{Appearance, AppearanceSample, MotionModel};
+use crate::graph::{
+    Appearance, AppearanceSample, MotionModel, MotionReport, Origin, Part, Splats, VisibilitySample,
+};
 
 fn splats(count: usize, degree: u8) -> Splats {
     let floats = 3 * cif_geometry::spherical_harmonics::coefficient_count(degree);

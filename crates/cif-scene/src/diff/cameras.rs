@@ -7,7 +7,7 @@ use cif_geometry::PinholeCamera;
 use glam::DQuat;
 use serde::Serialize;
 
-use super::{SAME_PLACE, SAME_TURN};
+use super::units::{SAME_PLACE, SAME_TURN};
 use crate::{CameraTrack, SceneGraph};
 
 /// Focal lengths closer than this part of themselves are the same.

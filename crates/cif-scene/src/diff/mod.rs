@@ -12,17 +12,12 @@ pub(crate) mod units;
 use serde::Serialize;
 
 pub use cameras::{CameraChange, CameraChangeKind};
+pub(crate) use pair::same_rows;
 pub use pair::{Pair, pairs};
 pub use splats::SplatChanges;
 
 use crate::{Node, NodeKind, SceneGraph};
 use units::{delta, key_codes};
-
-/// Distances below this part of `1 + |position|` are none, world units.
-pub(crate) const SAME_PLACE: f64 = 1e-5;
-
-/// Turns below this are none, radians.
-pub(crate) const SAME_TURN: f64 = 1e-4;
 
 /// Kind of an object's difference.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -177,12 +172,6 @@ pub fn diff(before: &SceneGraph, after: &SceneGraph) -> SceneDiff {
         }
     }
     result
-}
-
-/// True when rows of two graphs mean the same Gaussians.
-pub(crate) fn same_rows(before: &SceneGraph, after: &SceneGraph) -> bool {
-    before.origin.field_fingerprint.is_some()
-        && before.origin.field_fingerprint == after.origin.field_fingerprint
 }
 
 /// Compares a pair.

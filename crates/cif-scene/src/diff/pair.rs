@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use super::same_rows;
 use crate::{Node, NodeKind, SceneGraph, Splats};
 
 /// Nodes that belong together, by position in their graphs.
@@ -84,4 +83,10 @@ fn original_of(node: &Node, owners: &BTreeMap<u32, usize>) -> Option<usize> {
     let (owner, count) =
         counts.into_iter().max_by_key(|(owner, count)| (*count, std::cmp::Reverse(*owner)))?;
     (count as f64 >= COPIED * node.splats.len() as f64).then_some(owner)
+}
+
+/// True when rows of two graphs mean the same Gaussians.
+pub(crate) fn same_rows(before: &SceneGraph, after: &SceneGraph) -> bool {
+    before.origin.field_fingerprint.is_some()
+        && before.origin.field_fingerprint == after.origin.field_fingerprint
 }

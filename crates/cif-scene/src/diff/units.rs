@@ -2,9 +2,14 @@
 
 use glam::{DQuat, DVec3};
 
-use super::{SAME_PLACE, SAME_TURN};
 use crate::graph::{Motion, PoseSample, pose_at};
 use crate::{Node, SceneGraph};
+
+/// Distances below this part of `1 + |position|` are none, world units.
+pub(crate) const SAME_PLACE: f64 = 1e-5;
+
+/// Turns below this are none, radians.
+pub(crate) const SAME_TURN: f64 = 1e-4;
 
 /// Splats of a node that share a frame: the node's, or a part's.
 #[derive(Clone, Debug)]

@@ -1,12 +1,8 @@
 //! Instance table and identity rows of an edited field.
 
-use std::collections::BTreeMap;
+use cif_field::{Identities, Instance};
 
-use cif_field::{Field, Identities, Instance};
-
-use super::{Plan, instance_of};
-use crate::SceneGraph;
-use crate::from_field::assignment;
+use super::plan::{Plan, instance_of};
 
 /// Instance of the base table (or one added after it), or none.
 pub(super) type Owner = Option<u16>;
@@ -18,28 +14,6 @@ pub(super) enum RowIdentity {
     Kept(u32),
     /// Its owner is told.
     Told(Owner),
-}
-
-/// Rows of each instance that are in no node of the graph: too faint to be seen, they still belong to it.
-pub(super) fn unseen_members(base: &Field, exported: &SceneGraph) -> BTreeMap<usize, Vec<u32>> {
-    let mut members: BTreeMap<usize, Vec<u32>> = BTreeMap::new();
-    if base.identities.is_none() {
-        return members;
-    }
-    let mut is_seen = vec![false; base.len()];
-    for row in exported.nodes.iter().flat_map(|node| &node.splats.rows) {
-        is_seen[*row as usize] = true;
-    }
-    // As if they could be seen.
-    let all: Vec<u32> = (0..base.len() as u32).collect();
-    let options = exported.origin.options.clone().unwrap_or_default();
-    let owners = assignment::assign(base, &assignment::most_probable(base), &all, &options);
-    for (row, owner) in owners.into_iter().enumerate().filter(|(row, _)| !is_seen[*row]) {
-        if let Some(owner) = owner {
-            members.entry(owner).or_default().push(row as u32);
-        }
-    }
-    members
 }
 
 /// The table without what was removed, and rows that name only what is left. `instances` is the base's table

@@ -16,23 +16,24 @@
 
 mod identities;
 mod parts;
-
-use std::collections::BTreeSet;
+mod plan;
 
 use cif_field::tracks::{NO_GROUP, TrackGroup, TrackPose, Tracks, VisibilityStep};
 use cif_field::{Field, Instance};
 use cif_geometry::spherical_harmonics::HarmonicsRotation;
 use glam::DVec3;
 
-use crate::diff::splats::{SplatPairs, coefficients, is_faded, is_recoloured, is_resized, pair};
+use crate::diff::splats::{coefficients, is_faded, is_recoloured, is_resized};
 use crate::diff::units::{Unit, delta, key_codes, matching, step};
-use crate::diff::{Pair, SceneDiff, diff, pairs, same_rows, visibility_differs};
+use crate::diff::{SceneDiff, diff, visibility_differs};
 use crate::motion::time_map::TimeMap;
 use crate::shape::flat::log_scale;
-use crate::to_field::{InstanceTable, NodeRows, logit, rows_of};
+use crate::to_field::{InstanceTable, NodeRows, logit};
+use crate::vectors::rows_of;
 use crate::{Node, NodeKind, SceneError, SceneGraph, build, naming};
-use identities::{Owner, RowIdentity, unseen_members};
+use identities::{Owner, RowIdentity};
 use parts::subset;
+use plan::{Plan, Step, instance_of};
 
 /// Applies the edits of a file to the field that the file was exported from, and lists them. `source` names the
 /// file, in errors and in the field's record. With `force` another field than the exported one is taken as
@@ -92,7 +93,7 @@ pub fn apply(
         return Ok((base.clone(), changes));
     }
     let plan = Plan::new(base, exported, edited)?;
-    let mut work = plan.start();
+    let mut work = Work::start(&plan);
     for (index, step) in plan.steps.iter().enumerate() {
         work.adjust(&plan, index, step);
     }
@@ -101,140 +102,6 @@ pub fn apply(
     }
     let field = work.finish(&plan, source, &changes)?;
     Ok((field, changes))
-}
-
-/// One pair of nodes and what becomes of their splats.
-struct Step {
-    pair: Pair,
-    splats: SplatPairs,
-    /// First row of a duplicate in the edited field.
-    first_copy: u32,
-    /// Base rows that nobody sees, but that belong to the object.
-    unseen: Vec<u32>,
-}
-
-struct Plan<'a> {
-    base: &'a Field,
-    exported: &'a SceneGraph,
-    edited: &'a SceneGraph,
-    times: TimeMap,
-    reference: f64,
-    steps: Vec<Step>,
-    /// Base row of every row that is kept or copied.
-    sources: Vec<u32>,
-    /// Row in the edited field of every base row that is kept.
-    new_of_base: Vec<Option<u32>>,
-    /// Base instances that go.
-    removed: BTreeSet<usize>,
-}
-
-impl<'a> Plan<'a> {
-    fn new(base: &'a Field, exported: &'a SceneGraph, edited: &'a SceneGraph) -> Result<Self, SceneError> {
-        let rows_match = same_rows(exported, edited);
-        let mut unseen = unseen_members(base, exported);
-        let mut deleted = vec![false; base.len()];
-        let mut removed = BTreeSet::new();
-        let mut steps = Vec::new();
-        for pair_of_nodes in pairs(exported, edited) {
-            let first = pair_of_nodes.before.map(|index| &exported.nodes[index]);
-            let second = pair_of_nodes.after.map(|index| &edited.nodes[index]);
-            if let Some(second) = second {
-                crate::to_field::check(second)?;
-            }
-            let mut step = Step {
-                pair: pair_of_nodes,
-                splats: SplatPairs::default(),
-                first_copy: 0,
-                unseen: Vec::new(),
-            };
-            let mut delete = |row: u32| deleted[row as usize] = true;
-            match (first, second) {
-                (Some(first), Some(second)) => {
-                    step.splats = pair(first, second, rows_match);
-                    if !pair_of_nodes.duplicate {
-                        let reshaped = step.splats.reshaped.iter().map(|(i, _)| i);
-                        step.splats
-                            .removed
-                            .iter()
-                            .chain(reshaped)
-                            .for_each(|i| delete(first.splats.rows[*i]));
-                        step.unseen = instance_of(first).and_then(|k| unseen.remove(&k)).unwrap_or_default();
-                    }
-                }
-                (Some(first), None) => {
-                    first.splats.rows.iter().copied().for_each(&mut delete);
-                    if let Some(index) = instance_of(first) {
-                        unseen.remove(&index).unwrap_or_default().into_iter().for_each(&mut delete);
-                        removed.insert(index);
-                    }
-                }
-                (None, Some(second)) => step.splats.added = (0..second.splats.len()).collect(),
-                (None, None) => {}
-            }
-            steps.push(step);
-        }
-        let mut sources: Vec<u32> = (0..base.len() as u32).filter(|row| !deleted[*row as usize]).collect();
-        let mut new_of_base = vec![None; base.len()];
-        for (new, old) in sources.iter().enumerate() {
-            new_of_base[*old as usize] = Some(new as u32);
-        }
-        for step in steps.iter_mut().filter(|step| step.pair.duplicate) {
-            step.first_copy = sources.len() as u32;
-            if let Some(first) = step.pair.before.map(|index| &exported.nodes[index]) {
-                sources.extend(step.splats.kept.iter().map(|(i, _)| first.splats.rows[*i]));
-            }
-        }
-        Ok(Self {
-            times: TimeMap::of_field(base),
-            reference: exported.time_codes.start(),
-            base,
-            exported,
-            edited,
-            steps,
-            sources,
-            new_of_base,
-            removed,
-        })
-    }
-
-    /// The base without what is deleted, with copies of what is duplicated.
-    fn start(&self) -> Work {
-        let mut field = self.base.gather(&self.sources);
-        let tracks = field
-            .tracks
-            .take()
-            .unwrap_or_else(|| Tracks { group_of: vec![NO_GROUP; field.len()], groups: Vec::new() });
-        let rows = (0..self.sources.len() as u32).map(RowIdentity::Kept).collect();
-        let instances = InstanceTable { entries: std::mem::take(&mut field.instances) };
-        Work { field, tracks, rows, instances, owners: vec![None; self.steps.len()] }
-    }
-
-    fn nodes(&self, step: &Step) -> (Option<&'a Node>, Option<&'a Node>) {
-        let before = step.pair.before.map(|index| &self.exported.nodes[index]);
-        (before, step.pair.after.map(|index| &self.edited.nodes[index]))
-    }
-
-    /// Rows in the edited field of the kept splats of a step, with their positions in both nodes.
-    fn kept_rows(&self, step: &Step, first: &Node) -> Vec<(u32, usize, usize)> {
-        let pairs = step.splats.kept.iter().enumerate();
-        pairs
-            .filter_map(|(place, (i, j))| {
-                let row = if step.pair.duplicate {
-                    Some(step.first_copy + place as u32)
-                } else {
-                    self.new_of_base[first.splats.rows[*i] as usize]
-                };
-                row.map(|row| (row, *i, *j))
-            })
-            .collect()
-    }
-}
-
-fn instance_of(node: &Node) -> Option<usize> {
-    match node.kind {
-        NodeKind::Instance { index, .. } => Some(index),
-        NodeKind::Background => None,
-    }
 }
 
 /// The field on its way.
@@ -248,6 +115,18 @@ struct Work {
 }
 
 impl Work {
+    /// The base without what is deleted, with copies of what is duplicated.
+    fn start(plan: &Plan<'_>) -> Self {
+        let mut field = plan.base.gather(&plan.sources);
+        let tracks = field
+            .tracks
+            .take()
+            .unwrap_or_else(|| Tracks { group_of: vec![NO_GROUP; field.len()], groups: Vec::new() });
+        let rows = (0..plan.sources.len() as u32).map(RowIdentity::Kept).collect();
+        let instances = InstanceTable { entries: std::mem::take(&mut field.instances) };
+        Self { field, tracks, rows, instances, owners: vec![None; plan.steps.len()] }
+    }
+
     /// Everything about a pair but its new splats.
     fn adjust(&mut self, plan: &Plan<'_>, index: usize, step: &Step) {
         let (Some(first), Some(second)) = plan.nodes(step) else { return };

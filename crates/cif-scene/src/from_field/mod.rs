@@ -2,10 +2,8 @@
 
 pub mod assignment;
 pub mod camera_tracks;
-pub mod frames;
 pub(crate) mod node;
 mod posed;
-pub mod source;
 
 use std::collections::BTreeSet;
 
@@ -17,15 +15,15 @@ use glam::DVec3;
 use crate::appearance::blur::Blur;
 use crate::appearance::visibility;
 use crate::appearance::{self, Opacities, Thinning};
+use crate::field_motion::FieldMotion;
+use crate::field_motion::frames::{Frame, Frames};
 use crate::from_field::assignment::Identity;
-use crate::from_field::frames::{Frame, Frames};
 use crate::from_field::node::{Naming, NodeInput};
-use crate::from_field::source::FieldMotion;
 use crate::graph::{Node, NodeKind, Origin, SceneGraph, TimeCodes};
 use crate::joint::{ToldParts, jointed_groups};
 use crate::motion::choose::{self, Chosen};
+use crate::motion::group::{MovingGroup, trimmed_box};
 use crate::motion::loose::{self, Change};
-use crate::motion::{MovingGroup, trimmed_box};
 use crate::shape::{colliders, flat, proxy};
 use crate::{MotionModel, MotionSource, SceneError, SceneOptions, naming, world};
 

@@ -7,17 +7,19 @@ use cif_geometry::RigidTransform;
 use cif_geometry::scalar::direct_sigmoid;
 use glam::DVec3;
 
+use crate::field_motion::frames::Frames;
 use crate::from_field::assignment::Identity;
-use crate::from_field::frames::Frames;
 use crate::graph::{
     Appearance, DenseMotion, IdentityShare, IdentityShares, Motion, Node, NodeKind, Part, PartsMotion,
     SHARES_PER_SPLAT, Splats,
 };
+use crate::graph::{MotionReport, ResidualStatistics};
 use crate::motion::choose::Chosen;
-use crate::motion::{MeanShape, MovingGroup, ResidualSum, add_turns_between, trimmed_box, vector};
+use crate::motion::group::{MeanShape, MovingGroup, trimmed_box};
+use crate::motion::residuals::{ResidualSum, add_turns_between};
 use crate::naming;
-use crate::report::{MotionReport, ResidualStatistics};
 use crate::shape::{extent, flat};
+use crate::vectors::vector;
 
 /// Kind, names and class of a node.
 pub(crate) struct Naming {

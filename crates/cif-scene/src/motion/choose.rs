@@ -7,13 +7,13 @@ use cif_geometry::RigidTransform;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::from_field::frames::{Frame, Frames};
-use crate::graph::{DenseSample, PoseSample, pose_at};
+use crate::field_motion::frames::{Frame, Frames};
+use crate::graph::{DENSE_BYTES, DenseSample, MotionModel, POSE_BYTES, PoseSample, SceneOptions, pose_at};
 use crate::motion::dense;
+use crate::motion::group::{MovingGroup, trimmed_box};
 use crate::motion::keys::{self, Moments};
 use crate::motion::parts::{self, Partition};
-use crate::motion::{MovingGroup, ResidualSum, trimmed_box};
-use crate::{MotionModel, SceneOptions};
+use crate::motion::residuals::ResidualSum;
 
 /// Partitions that are fitted to all Gaussians and times before a group is given up to dense motion.
 const TRIED_PARTITIONS: usize = 3;
@@ -28,11 +28,6 @@ const UNSHOWN: f64 = 0.5;
 const RESTING: f64 = 5.0;
 /// Share of the tolerance within which rounding alone moves a part.
 const ROUNDING: f64 = 1e-6;
-/// Bytes of a pose: three doubles and a quaternion of floats.
-pub(crate) const POSE_BYTES: usize = 3 * 8 + 4 * 4;
-/// Bytes of a splat at one dense sample: centre and orientation as floats.
-pub(crate) const DENSE_BYTES: usize = 28;
-
 /// Chosen motion of a group.
 pub(crate) enum Chosen {
     Static,

@@ -2,14 +2,16 @@
 
 use cif_geometry::{RigidTransform, quaternion};
 
-use crate::from_field::frames::Frame;
+use crate::field_motion::frames::Frame;
 use crate::graph::DenseSample;
+use crate::motion::group::MovingGroup;
 use crate::motion::keys;
-use crate::motion::placement::{angle_between, normalized_lerp};
-use crate::motion::{MovingGroup, dot, quaternion_of, trimmed_rms, vector};
+use crate::motion::residuals::trimmed_rms;
+use crate::placement::{angle_between, normalized_lerp};
 use crate::shape::extent;
 use crate::shape::flat;
 use crate::shape::proxy::systematic;
+use crate::vectors::{dot, quaternion_of, vector};
 
 /// Relative change of a scale over time that makes scales sampled.
 const SAME_SCALE: f64 = 1e-4;

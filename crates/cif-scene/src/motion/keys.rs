@@ -13,8 +13,8 @@ use cif_geometry::RigidTransform;
 use glam::{DMat3, DVec3};
 
 use crate::PoseSample;
+use crate::graph::TimeResidual;
 use crate::graph::pose_at;
-use crate::report::TimeResidual;
 
 /// Part of the slack that samples may use up; the rest is for rounding to single precision.
 const USED_SLACK: f64 = 0.999;

@@ -12,8 +12,8 @@ use cif_geometry::quaternion;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::from_field::frames::Frames;
-use crate::motion::{dot, vector};
+use crate::field_motion::frames::Frames;
+use crate::vectors::{dot, vector};
 
 /// Change below which a splat stands still in a picture: of its place in units of its own standard deviation (the
 /// middle one of the three: flat splats are seen from their broad side), of its size in logarithms, and of its

@@ -11,16 +11,17 @@
 //! of their own unless they are many enough.
 
 use cif_geometry::RigidTransform;
+use cif_geometry::align::procrustes::weighted_procrustes;
+use cif_geometry::stats::weighted_quantile;
 use glam::{DMat3, DVec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use nalgebra::Matrix3;
 use rayon::prelude::*;
 
-use crate::from_field::frames::Frame;
-use crate::motion::{trimmed_rms, vector};
+use crate::field_motion::frames::Frame;
+use crate::motion::residuals::trimmed_rms;
 use crate::shape::proxy::systematic;
-use cif_geometry::align::procrustes::weighted_procrustes;
-use cif_geometry::stats::weighted_quantile;
+use crate::vectors::vector;
 
 /// Gaussians that parts are found from.
 const SAMPLED_GAUSSIANS: usize = 512;

@@ -5,7 +5,8 @@ use cif_geometry::Bounds;
 use glam::DVec3;
 use serde::Serialize;
 
-use crate::{ConvexHull, LabelMatch, LabelQuery, Node, QueryError, SceneGraph, query, world};
+pub use crate::shape::convex_hull::hull_volume;
+use crate::{LabelMatch, LabelQuery, Node, QueryError, SceneGraph, query, world};
 
 /// When something is looked for, in time codes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -137,23 +138,6 @@ pub fn speed(codes: &[f64], path: &[DVec3], codes_per_second: f64) -> f64 {
     }
 }
 
-/// Volume inside closed meshes of outward triangles; 0 without any.
-#[must_use]
-pub fn hull_volume(hulls: &[ConvexHull]) -> f64 {
-    let corner = |hull: &ConvexHull, index: u32| -> Option<DVec3> {
-        hull.points.get(index as usize).map(|p| DVec3::from_array(p.map(f64::from)))
-    };
-    hulls
-        .iter()
-        .map(|hull| {
-            let signed = hull.triangles.iter().filter_map(|[a, b, c]| {
-                Some(corner(hull, *a)?.dot(corner(hull, *b)?.cross(corner(hull, *c)?)) / 6.0)
-            });
-            signed.sum::<f64>().abs()
-        })
-        .sum()
-}
-
 /// Volume of an object: of its hulls where it has any, else of its box.
 #[must_use]
 pub fn volume(hulls: f64, bounds: &Bounds) -> (Option<f64>, Option<VolumeOf>) {
@@ -264,6 +248,7 @@ fn describe(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ConvexHull;
 
     #[test]
     fn codes_lie_around_a_time_and_fill_an_interval() {

@@ -5,12 +5,13 @@
 
 use std::collections::BTreeSet;
 
+use cif_geometry::stats::weighted_quantile;
 use glam::DVec3;
 use nalgebra::Matrix3;
 use parry3d_f64::math::Vector;
 use parry3d_f64::transformation::try_convex_hull;
 
-use cif_geometry::stats::weighted_quantile;
+use crate::graph::ConvexHull;
 
 /// Most corners of a hull; what simulators and USD physics accept.
 pub const MAX_CORNERS: usize = 64;
@@ -212,6 +213,23 @@ fn few_corners(corners: &[DVec3]) -> Option<HullMesh> {
         }
         chosen.push(furthest);
     }
+}
+
+/// Volume inside closed meshes of outward triangles; 0 without any.
+#[must_use]
+pub fn hull_volume(hulls: &[ConvexHull]) -> f64 {
+    let corner = |hull: &ConvexHull, index: u32| -> Option<DVec3> {
+        hull.points.get(index as usize).map(|p| DVec3::from_array(p.map(f64::from)))
+    };
+    hulls
+        .iter()
+        .map(|hull| {
+            let signed = hull.triangles.iter().filter_map(|[a, b, c]| {
+                Some(corner(hull, *a)?.dot(corner(hull, *b)?.cross(corner(hull, *c)?)) / 6.0)
+            });
+            signed.sum::<f64>().abs()
+        })
+        .sum()
 }
 
 #[cfg(test)]

@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 use cif_geometry::quaternion;
 use glam::{DVec3, IVec3};
 
-use crate::query::search::hull_volume;
+use crate::shape::convex_hull::hull_volume;
 use crate::{ConvexHull, Motion, Node, SceneGraph};
 use cif_geometry::stats::weighted_quantile;
 

@@ -1,6 +1,7 @@
 //! Solids and points around what a node shows.
 
 pub(crate) mod body;
+pub mod boxes;
 pub mod colliders;
 pub mod convex_hull;
 pub mod extent;

@@ -74,9 +74,9 @@ fn pose(time: f64) -> RigidTransform {
 /// Moves rows of a field.
 fn moved(field: &Field, rows: std::ops::Range<usize>, by: &RigidTransform) -> Gaussians {
     let mut gaussians = field.gaussians.clone();
-    let turn = motion::quaternion_of(&by.rotation).map(|v| v as f32);
+    let turn = vectors::quaternion_of(&by.rotation).map(|v| v as f32);
     for row in rows {
-        let at = by.apply(motion::vector(gaussians.means[row]));
+        let at = by.apply(vectors::vector(gaussians.means[row]));
         gaussians.means[row] = at.to_array().map(|v| v as f32);
         gaussians.quaternions[row] = cif_geometry::quaternion::multiply(turn, gaussians.quaternions[row]);
     }
@@ -229,8 +229,8 @@ fn bending_is_dense_and_reproduces_the_trained_splats() {
         let expected = bend(*time);
         let world_from_local = node.world_transform(sample.time_code);
         for (k, &row) in node.splats.rows.iter().enumerate() {
-            let at = world_from_local.apply(motion::vector(sample.means[k]));
-            assert!((at - motion::vector(expected.means[row as usize])).length() < 1e-5);
+            let at = world_from_local.apply(vectors::vector(sample.means[k]));
+            assert!((at - vectors::vector(expected.means[row as usize])).length() < 1e-5);
         }
         assert!(sample.scales.is_some(), "scales change");
         let again = crate::shape::extent::ellipsoid_bounds(
@@ -398,7 +398,7 @@ fn splats_hold_the_degree_in_use_and_extents_hold_the_splats() {
     let node = &graph.nodes[0];
     assert_eq!(node.splats.sh_coefficients.len(), 60 * 9 * 3);
     for (mean, scale) in node.splats.means.iter().zip(&node.splats.scales) {
-        let at = motion::vector(*mean);
+        let at = vectors::vector(*mean);
         let reach = f64::from(3.0 * scale.iter().copied().fold(f32::INFINITY, f32::min)) * 0.999;
         assert!((at - reach).cmpge(node.extent.low).all() && (at + reach).cmple(node.extent.high).all());
     }

@@ -45,7 +45,7 @@ fn cabinet_field() -> Field {
     let mut field = field(1);
     for row in 0..60 {
         let shift = [DVec3::ZERO, DVec3::Z * 0.45, DVec3::Y * -0.45][body(row)];
-        let at = motion::vector(field.gaussians.means[row]) + shift;
+        let at = vectors::vector(field.gaussians.means[row]) + shift;
         field.gaussians.means[row] = at.to_array().map(|v| v as f32);
     }
     field
@@ -91,9 +91,9 @@ fn decisive(graph: &SceneGraph, node: &Node, source: &dyn Fn(f64) -> Gaussians) 
                 .means
                 .iter()
                 .zip(&node.splats.rows)
-                .map(|(mean, &row)| mean.distance(motion::vector(trained.means[row as usize])))
+                .map(|(mean, &row)| mean.distance(vectors::vector(trained.means[row as usize])))
                 .collect();
-            motion::trimmed_rms(&distances, &vec![1.0; distances.len()], 0.05).0
+            motion::residuals::trimmed_rms(&distances, &vec![1.0; distances.len()], 0.05).0
         })
         .fold(0.0, f64::max)
 }

@@ -30,7 +30,7 @@ fn cloud(count: usize, size: DVec3) -> Vec<DVec3> {
 
 fn mesh(hull: &ConvexHull) -> HullMesh {
     HullMesh {
-        points: hull.points.iter().map(|point| motion::vector(*point)).collect(),
+        points: hull.points.iter().map(|point| vectors::vector(*point)).collect(),
         triangles: hull.triangles.clone(),
     }
 }
@@ -57,7 +57,7 @@ fn a_collider_holds_its_splats_and_no_stragglers() {
     let mesh = mesh(&hulls[0]);
     assert!(mesh.points.len() <= crate::shape::convex_hull::MAX_CORNERS);
     let body: Vec<DVec3> =
-        (0..500).filter(|k| k % 7 != 0).map(|k| motion::vector(node.splats.means[k])).collect();
+        (0..500).filter(|k| k % 7 != 0).map(|k| vectors::vector(node.splats.means[k])).collect();
     assert!(share_inside(&hulls, &body) >= 0.99, "{}", share_inside(&hulls, &body));
     assert!(mesh.points.iter().all(|point| point.abs().cmplt(DVec3::new(0.25, 0.15, 0.1)).all()), "{mesh:?}");
     assert!((0.4 * 0.2 * 0.1..0.5 * 0.3 * 0.2).contains(&mesh.volume()), "{}", mesh.volume());
@@ -69,7 +69,7 @@ fn shares_held(hulls: &[ConvexHull], node: &Node) -> [f64; 2] {
     let opacities: Vec<f64> = node.splats.opacities.iter().map(|opacity| f64::from(*opacity)).collect();
     [opacities, node.splats.importance()].map(|weights| {
         let inside = (0..node.splats.len()).filter(|k| {
-            let centre = motion::vector(node.splats.means[*k]);
+            let centre = vectors::vector(node.splats.means[*k]);
             hulls.iter().any(|hull| hull.outside(centre) < 1e-6)
         });
         inside.map(|k| weights[k]).sum::<f64>() / weights.iter().sum::<f64>()

@@ -1,8 +1,13 @@
 use cif_field::JointKind;
-use cif_geometry::RigidTransform;
+use cif_field::tracks::{Joint, TrackGroup};
+use cif_geometry::spherical_harmonics::HarmonicsRotation;
+use cif_geometry::{Bounds, RigidTransform};
+use glam::{DQuat, DVec3};
 
 use super::*;
+use crate::graph::{DenseMotion, Motion, Node, PoseSample, pose_at};
 use crate::testing::{MEMBERS, TIMES, recorded_field};
+use crate::vectors::rows_of;
 use crate::{MotionModel, SceneOptions, Tolerance, build};
 
 fn options() -> SceneOptions {

@@ -3,7 +3,8 @@
 use cif_scene::{CameraTrack, PoseSample};
 use pyo3::prelude::*;
 
-use super::{VARYING, transforms};
+use super::context::VARYING;
+use super::transforms;
 use crate::conventions::{UsdCamera, usd_camera};
 use crate::layer::Layer;
 use crate::pxr::Pxr;

@@ -5,7 +5,8 @@ use cif_scene::{PoseSample, SceneGraph, UpAxis, ground_height};
 use glam::{DQuat, DVec3};
 use pyo3::prelude::*;
 
-use super::{Scene, UNIFORM, VARYING, transforms};
+use super::context::{Scene, UNIFORM, VARYING};
+use super::transforms;
 use crate::layer::Layer;
 use crate::tokens;
 

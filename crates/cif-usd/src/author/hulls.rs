@@ -4,15 +4,14 @@ use cif_scene::{ConvexHull, Node};
 use glam::Vec3;
 use pyo3::prelude::*;
 
-use super::instance::parts;
-use super::{Scene, UNIFORM, VARYING};
+use super::context::{Scene, UNIFORM, VARYING};
 use crate::layer::{Layer, child};
 use crate::tokens;
 
 pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, place: &str, node: &Node) -> PyResult<()> {
     let masses = cif_scene::masses(scene.graph, node, scene.options.density);
     for (index, (hull, mass)) in node.colliders.iter().zip(masses).enumerate() {
-        let part = hull.part.zip(parts(node)).and_then(|(part, motion)| motion.parts.get(part));
+        let part = hull.part.zip(node.motion.parts()).and_then(|(part, motion)| motion.parts.get(part));
         let place = part.map_or_else(|| place.to_owned(), |part| child(place, &part.name));
         // The number tells the order over all parts.
         let name = match index {

@@ -1,10 +1,11 @@
 //! One prim per instance: labels, our schema, variants, and where its arrays are kept.
 
-use cif_scene::{Motion, Node, NodeKind, PartsMotion, extent};
+use cif_scene::{Motion, Node, NodeKind, extent};
 use pyo3::prelude::*;
 
+use super::context::{Scene, UNIFORM, VARYING};
 use super::levels::{LEVELS, Level};
-use super::{Scene, UNIFORM, VARYING, hulls, levels, metadata, physics, proxies, splats, transforms};
+use super::{hulls, levels, metadata, physics, proxies, splats, transforms};
 use crate::layer::{Layer, Prim, child};
 use crate::pxr::Pxr;
 use crate::tokens::{self, instance, variants};
@@ -39,7 +40,7 @@ pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, node: &Node) 
     visibility(&prim, node)?;
     extents_hint(pxr, &prim, node)?;
     transforms::order(pxr, &prim)?;
-    for (index, part) in parts(node).map_or(&[][..], |motion| &motion.parts).iter().enumerate() {
+    for (index, part) in node.motion.parts().map_or(&[][..], |motion| &motion.parts).iter().enumerate() {
         let inside = layer.define(&child(prim.path(), &part.name), "Xform")?;
         transforms::order(pxr, &inside)?;
         // Composition orders children as it likes.
@@ -48,14 +49,6 @@ pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, node: &Node) 
     }
     physics::author(scene, layer, &prim, node)?;
     contents(scene, &prim, layer, node)
-}
-
-/// The parts of a node that has some.
-pub(super) fn parts(node: &Node) -> Option<&PartsMotion> {
-    match &node.motion {
-        Motion::Parts(motion) => Some(motion),
-        Motion::Static | Motion::Rigid(_) | Motion::Dense(_) => None,
-    }
 }
 
 /// Authors the properties that no standard schema holds.
@@ -157,7 +150,7 @@ fn contents(
     let file = format!("{}.usdc", node.name);
     let asset = format!("./{called}/{file}");
     let payload = Layer::create(scene.pxr, &folder.join(&file))?;
-    metadata(scene, &payload, tokens::ROLE_PAYLOAD, LEVELS[0].prim)?;
+    metadata::author(scene, &payload, tokens::ROLE_PAYLOAD, LEVELS[0].prim)?;
     payload.define(tokens::COMMON, "Xform")?;
     shared(scene, &payload, tokens::COMMON, node)?;
     prim.payload(&asset, tokens::COMMON)?;
@@ -188,7 +181,7 @@ fn splats_of(
 ) -> PyResult<()> {
     let kept = levels::kept(node, level);
     let some = |part| levels::selection(node, part, level, kept.as_deref());
-    match parts(node) {
+    match node.motion.parts() {
         None => splats::author(scene, layer, place, &node.name, &some(None)),
         Some(motion) => motion.parts.iter().enumerate().try_for_each(|(index, part)| {
             let name = format!("{}_{}", node.name, part.name);

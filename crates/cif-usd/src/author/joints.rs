@@ -7,19 +7,18 @@ use cif_scene::{Node, Part, PartJoint, PoseSample};
 use glam::{DQuat, DVec3};
 use pyo3::prelude::*;
 
-use super::instance::parts;
-use super::{Scene, UNIFORM, VARYING};
+use super::context::{Scene, UNIFORM, VARYING};
 use crate::layer::{Layer, Prim, child};
 use crate::tokens;
 
 /// True where parts of a node are tied by joints.
 pub(super) fn has_joints(node: &Node) -> bool {
-    parts(node).is_some_and(|motion| motion.parts.iter().any(|part| part.joint.is_some()))
+    node.motion.parts().is_some_and(|motion| motion.parts.iter().any(|part| part.joint.is_some()))
 }
 
 /// True of a part that others are tied to and that is tied to none: the root of an articulation.
 pub(super) fn is_root(node: &Node, part: usize) -> bool {
-    parts(node).is_some_and(|motion| {
+    node.motion.parts().is_some_and(|motion| {
         let joint = |part: &Part| part.joint;
         motion.parts[part].joint.is_none()
             && motion.parts.iter().filter_map(joint).any(|joint| joint.base == part)
@@ -36,7 +35,7 @@ pub(super) fn author(
     node: &Node,
     enabled: bool,
 ) -> PyResult<()> {
-    let Some(motion) = parts(node) else { return Ok(()) };
+    let Some(motion) = node.motion.parts() else { return Ok(()) };
     let pxr = scene.pxr;
     let body = |name: &str| child(&child(tokens::WORLD, &node.name), name);
     for (index, part) in motion.parts.iter().enumerate() {

@@ -9,7 +9,6 @@ use std::ops::Range;
 
 use cif_scene::{Appearance, DenseSample, Motion, Node, Splats};
 
-use super::instance;
 use crate::tokens::variants;
 
 /// A level of detail.
@@ -56,7 +55,7 @@ pub(super) fn selection<'a>(
     level: &Level,
     kept: Option<&[u32]>,
 ) -> Selection<'a> {
-    let range = match (instance::parts(node), part) {
+    let range = match (node.motion.parts(), part) {
         (Some(motion), Some(part)) => motion.parts[part].splats.clone(),
         _ => 0..node.splats.len(),
     };

@@ -5,8 +5,8 @@
 use cif_scene::{ConvexHull, Motion, Node, Part, PoseSample};
 use pyo3::prelude::*;
 
-use super::instance::parts;
-use super::{Scene, VARYING, joints, transforms};
+use super::context::{Scene, VARYING};
+use super::{joints, transforms};
 use crate::layer::{Layer, Prim};
 use crate::pxr::Pxr;
 use crate::tokens::{self, variants};
@@ -39,7 +39,8 @@ pub(super) fn author(
         joints::author(scene, layer, prim, node, false)?;
         return poses(pxr, prim, node, true);
     }
-    let part_tracks = parts(node).into_iter().flat_map(|motion| &motion.parts).map(|part| &part.track);
+    let part_tracks =
+        node.motion.parts().into_iter().flat_map(|motion| &motion.parts).map(|part| &part.track);
     let moves = !node.track().is_empty() || part_tracks.into_iter().any(|track| !track.is_empty());
     if !moves {
         poses(pxr, prim, node, true)?;
@@ -64,7 +65,7 @@ pub(super) fn author(
 fn poses(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, node: &Node, sampled: bool) -> PyResult<()> {
     let track = |track: &[PoseSample]| if sampled { track.to_vec() } else { Vec::new() };
     transforms::values(pxr, prim, &transforms::rest(node.track(), node.pivot), &track(node.track()))?;
-    for part in parts(node).map_or(&[][..], |motion| &motion.parts) {
+    for part in node.motion.parts().map_or(&[][..], |motion| &motion.parts) {
         let rest = transforms::rest(&part.track, part.pivot);
         transforms::values(pxr, &prim.child(&part.name)?, &rest, &track(&part.track))?;
     }
@@ -103,7 +104,7 @@ impl Body<'_> {
 
 /// The parts that have colliders of their own, where all colliders are theirs; else the whole.
 fn bodies(node: &Node) -> Vec<Body<'_>> {
-    let motion = parts(node).filter(|_| node.colliders.iter().all(|hull| hull.part.is_some()));
+    let motion = node.motion.parts().filter(|_| node.colliders.iter().all(|hull| hull.part.is_some()));
     let Some(motion) = motion else { return vec![Body { part: None }] };
     let has_collider = |index: usize| node.colliders.iter().any(|hull| hull.part == Some(index));
     let with = motion.parts.iter().enumerate().filter(|(index, _)| has_collider(*index));

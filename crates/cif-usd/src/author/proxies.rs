@@ -7,14 +7,14 @@
 use cif_scene::{Motion, Node};
 use pyo3::prelude::*;
 
-use super::instance::parts;
-use super::{Scene, UNIFORM, VARYING, splats};
+use super::context::{Scene, UNIFORM, VARYING};
+use super::splats;
 use crate::layer::{Layer, child};
 use crate::tokens;
 
 pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, place: &str, node: &Node) -> PyResult<()> {
     let Some(proxy) = &node.proxy else { return Ok(()) };
-    match parts(node) {
+    match node.motion.parts() {
         None => points(scene, layer, place, node, 0..proxy.indices.len()),
         Some(motion) => motion.parts.iter().try_for_each(|part| {
             // Indices ascend, so those of a part stand together.

@@ -5,8 +5,8 @@ use cif_geometry::{Bounds, RigidTransform};
 use cif_scene::{IdentityShares, extent};
 use pyo3::prelude::*;
 
+use super::context::{Scene, UNIFORM, VARYING};
 use super::levels::Selection;
-use super::{Scene, UNIFORM, VARYING};
 use crate::layer::{Layer, Prim, child};
 use crate::pxr::Pxr;
 use crate::{primvars, tokens};

@@ -4,7 +4,7 @@ use cif_scene::{CaptureFrame, PoseSample};
 use glam::{DQuat, DVec3};
 use pyo3::prelude::*;
 
-use super::{UNIFORM, VARYING};
+use super::context::{UNIFORM, VARYING};
 use crate::layer::Prim;
 use crate::pxr::Pxr;
 

@@ -7,7 +7,7 @@ use glam::{DVec2, DVec3};
 use pyo3::prelude::*;
 
 use super::values::{attribute, plain, samples, text, value, vector};
-use super::{labels, stage::Reading};
+use super::{labels, reading::Reading};
 use crate::conventions::{self, UsdCamera};
 use crate::tokens;
 

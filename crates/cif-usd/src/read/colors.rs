@@ -4,7 +4,7 @@ use cif_scene::assemble::ColorEncoding;
 use glam::DMat3;
 use pyo3::prelude::*;
 
-use super::stage::Reading;
+use super::reading::Reading;
 use super::values::{self, text};
 
 /// Names of what splats without any colour space are: display-referred sRGB. The first is that of USD, the second that

@@ -5,7 +5,7 @@ use cif_scene::PartJoint;
 use glam::{DQuat, DVec3};
 use pyo3::prelude::*;
 
-use super::nodes::Owner;
+use super::owner::Owner;
 use super::values::{path, quaternion, text, value, vec3};
 use crate::pxr::Pxr;
 use crate::tokens;

@@ -1,35 +1,17 @@
 //! An object from a prim and the splat prims under it.
 
-use cif_scene::assemble::{Identity, Piece, Placement, Prim, PrimName, Shape, Track};
+use cif_scene::assemble::{Piece, Placement, Prim, PrimName, Shape, Track};
 use cif_scene::{ConvexHull, MotionModel, MotionReport, PointProxy, Splats};
 use glam::{DAffine3, DVec3};
 use pyo3::prelude::*;
 
 use super::joints::joints;
 use super::labels::{self, Recorded};
+use super::owner::Owner;
+use super::reading::Reading;
 use super::splats::SplatPrim;
-use super::stage::Reading;
 use super::values::{attribute, text, value};
 use crate::{UsdError, primvars, tokens};
-
-/// A prim that becomes a node.
-pub(super) struct Owner<'py> {
-    pub(super) prim: Bound<'py, PyAny>,
-    pub(super) path: String,
-    /// Properties of our schema on the prim.
-    pub(super) recorded: Recorded,
-    pub(super) splats: Vec<SplatPrim<'py>>,
-}
-
-impl Owner<'_> {
-    fn identity(&self, original: bool) -> Identity {
-        match (self.recorded.background, self.recorded.id) {
-            (true, _) => Identity::Background,
-            (false, Some(id)) => Identity::Recorded { id, index: self.recorded.index, original },
-            (false, None) => Identity::New,
-        }
-    }
-}
 
 /// Prim that the assembler makes a node of.
 pub(super) fn read<'py>(reading: &Reading<'_, 'py>, owner: &Owner<'py>) -> Result<Prim, UsdError> {

@@ -8,9 +8,11 @@ use pyo3::prelude::*;
 
 use super::labels::{DirectLabels, all_prims};
 use super::open::{Instances, open_for_labels};
-use crate::find::USE_EXTENTS_HINTS;
 use crate::pxr::{self, Pxr, reason};
 use crate::{ReadOptions, UsdError, conventions, tokens};
+
+/// Boxes are those that models give of themselves, where they do: of what can be seen.
+pub(crate) const USE_EXTENTS_HINTS: bool = true;
 
 pub(crate) fn query(
     path: &Path,

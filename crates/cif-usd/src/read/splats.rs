@@ -9,7 +9,7 @@ use pyo3::prelude::*;
 
 use super::arrays::ArrayError;
 use super::colors;
-use super::stage::Reading;
+use super::reading::Reading;
 use super::values::{attribute, plain, samples, value};
 use crate::{UsdError, primvars, tokens};
 

@@ -12,44 +12,15 @@ use pyo3::prelude::*;
 use super::arrays::Arrays;
 use super::frames::Frames;
 use super::labels::{self, Recorded};
-use super::nodes::{self, Owner};
+use super::nodes;
 use super::open::Instances;
+use super::owner::Owner;
+use super::reading::Reading;
 use super::splats::SplatPrim;
 use super::values::{self, plain, text};
 use super::{cameras, open};
 use crate::pxr::{self, Pxr, reason};
 use crate::{ReadOptions, UsdError, tokens};
-
-/// Context that all parts of the reader share.
-pub(super) struct Reading<'a, 'py> {
-    pub(super) pxr: &'a Pxr<'py>,
-    path: &'a Path,
-    pub(super) arrays: Arrays<'a, 'py>,
-    pub(super) frames: Frames<'a, 'py>,
-    /// First time code.
-    pub(super) start: f64,
-    /// First and last frame, for nodes that do not say theirs.
-    pub(super) source_frames: (usize, usize),
-    warnings: RefCell<Vec<String>>,
-}
-
-impl Reading<'_, '_> {
-    pub(super) fn python(&self, error: &PyErr) -> UsdError {
-        UsdError::Unusable { path: self.path.to_owned(), reason: reason(self.pxr.py, error) }
-    }
-
-    pub(super) fn prim_error(&self, prim: &str, problem: String, fix: &'static str) -> UsdError {
-        UsdError::Prim { path: self.path.to_owned(), prim: prim.to_owned(), problem, fix }
-    }
-
-    pub(super) fn warn(&self, warning: String) {
-        let mut warnings = self.warnings.borrow_mut();
-        // Samples over time say the same again.
-        if !warnings.contains(&warning) {
-            warnings.push(warning);
-        }
-    }
-}
 
 /// Our entry in the `customLayerData` of a layer.
 #[derive(Default)]

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use cif_bench::export::{Rung, measure};
-use cif_scene::report::ReportRow;
+use cif_scene::graph::ReportRow;
 use cif_scene::{SceneFormat, SceneOptions, Tolerance};
 use clap::Args;
 

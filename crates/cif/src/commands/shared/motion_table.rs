@@ -1,6 +1,6 @@
 //! Columns of motion in the tables of `cif export` and `cif bench export`.
 
-use cif_scene::report::ReportRow;
+use cif_scene::graph::ReportRow;
 
 /// Headings of [`cells`].
 pub(in crate::commands) const HEADINGS: [&str; 10] =

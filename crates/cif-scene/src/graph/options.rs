@@ -4,7 +4,9 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{MotionModel, SceneError, UpAxis};
+use cif_geometry::UpAxis;
+
+use super::motion::MotionModel;
 
 /// Largest deviation of a simplified motion from the trained one.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -35,10 +37,10 @@ impl Tolerance {
 }
 
 impl FromStr for Tolerance {
-    type Err = SceneError;
+    type Err = OptionError;
 
     /// `0.5%` is a percentage, `0.002` are world units.
-    fn from_str(text: &str) -> Result<Self, SceneError> {
+    fn from_str(text: &str) -> Result<Self, OptionError> {
         let trimmed = text.trim();
         let (number, percent) = match trimmed.strip_suffix('%') {
             Some(number) => (number.trim_end(), true),
@@ -48,13 +50,25 @@ impl FromStr for Tolerance {
             Ok(value) if value.is_finite() && value >= 0.0 => {
                 Ok(if percent { Self::Percent(value) } else { Self::Absolute(value) })
             }
-            _ => Err(SceneError::Option {
+            _ => Err(OptionError {
                 option: "tolerance",
                 value: text.to_owned(),
                 expected: "a distance in world units (0.002) or a percentage of the instance size (1%)",
             }),
         }
     }
+}
+
+/// A value that an option does not take.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{option} is {value}, but must be {expected}")]
+pub struct OptionError {
+    /// The option.
+    pub option: &'static str,
+    /// Its value, as given.
+    pub value: String,
+    /// Values that it takes.
+    pub expected: &'static str,
 }
 
 /// Captured frame numbers, both ends included. Frame numbers index [`cif_field::Timeline::times`].
@@ -67,10 +81,10 @@ pub struct FrameRange {
 }
 
 impl FromStr for FrameRange {
-    type Err = SceneError;
+    type Err = OptionError;
 
     /// `12` or `0:71`.
-    fn from_str(text: &str) -> Result<Self, SceneError> {
+    fn from_str(text: &str) -> Result<Self, OptionError> {
         let parse = |part: &str| part.trim().parse::<usize>().ok();
         let range = match text.split_once(':') {
             Some((first, last)) => parse(first).zip(parse(last)),
@@ -78,7 +92,7 @@ impl FromStr for FrameRange {
         };
         match range {
             Some((first, last)) if first <= last => Ok(Self { first, last }),
-            _ => Err(SceneError::Option {
+            _ => Err(OptionError {
                 option: "frame range",
                 value: text.to_owned(),
                 expected: "FIRST:LAST with FIRST <= LAST, or one frame number",
@@ -161,12 +175,12 @@ impl Default for SceneOptions {
 
 impl SceneOptions {
     /// Refuses values outside their range.
-    pub(crate) fn validate(&self) -> Result<(), SceneError> {
+    pub(crate) fn validate(&self) -> Result<(), OptionError> {
         let unit = |option, value: f32| {
             if (0.0..=1.0).contains(&value) {
                 Ok(())
             } else {
-                Err(SceneError::Option { option, value: value.to_string(), expected: "between 0 and 1" })
+                Err(OptionError { option, value: value.to_string(), expected: "between 0 and 1" })
             }
         };
         unit("min_opacity", self.min_opacity)?;
@@ -174,35 +188,31 @@ impl SceneOptions {
         unit("background_threshold", self.background_threshold)?;
         let (Tolerance::Absolute(tolerance) | Tolerance::Percent(tolerance)) = self.tolerance;
         if !(tolerance.is_finite() && tolerance >= 0.0) {
-            return Err(SceneError::Option {
+            return Err(OptionError {
                 option: "tolerance",
                 value: tolerance.to_string(),
                 expected: "0 or more",
             });
         }
         if !(self.appearance_tolerance.is_finite() && self.appearance_tolerance >= 0.0) {
-            return Err(SceneError::Option {
+            return Err(OptionError {
                 option: "appearance tolerance",
                 value: self.appearance_tolerance.to_string(),
                 expected: "0 or more",
             });
         }
         if !(2..=64).contains(&self.max_parts) {
-            return Err(SceneError::Option {
+            return Err(OptionError {
                 option: "max_parts",
                 value: self.max_parts.to_string(),
                 expected: "2 to 64",
             });
         }
         if self.frame_step == 0 {
-            return Err(SceneError::Option {
-                option: "frame_step",
-                value: "0".into(),
-                expected: "1 or more",
-            });
+            return Err(OptionError { option: "frame_step", value: "0".into(), expected: "1 or more" });
         }
         if let Some(unit) = self.meters_per_unit.filter(|unit| !(unit.is_finite() && *unit > 0.0)) {
-            return Err(SceneError::Option {
+            return Err(OptionError {
                 option: "meters_per_unit",
                 value: unit.to_string(),
                 expected: "above 0",

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use cif_field::Gaussians;
 use cif_field::gaussians::SH_FLOATS;
 
-use crate::MotionSource;
+use super::source::MotionSource;
 
 /// Bytes of frames that are kept; what does not fit is deformed again when asked for.
 const KEPT_BYTES: usize = 512 << 20;

@@ -5,7 +5,8 @@ use cif_geometry::Bounds;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-use crate::{Motion, MotionModel, Node, SceneGraph, Splats};
+use super::motion::{Motion, MotionModel};
+use super::splats::Splats;
 
 /// Residuals of a motion model against the trained motion, world units.
 ///
@@ -121,33 +122,5 @@ impl MotionReport {
             parts: motion.part_count(),
             seconds: 0.0,
         }
-    }
-}
-
-/// One line of the table that a command prints.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct ReportRow {
-    /// Node name.
-    pub name: String,
-    /// Human name.
-    pub label: String,
-    /// Motion.
-    #[serde(flatten)]
-    pub motion: MotionReport,
-    /// Seconds spent fitting and choosing.
-    pub seconds: f64,
-}
-
-impl SceneGraph {
-    /// The motion table, one row per node.
-    #[must_use]
-    pub fn motion_table(&self) -> Vec<ReportRow> {
-        let row = |node: &Node| ReportRow {
-            name: node.name.clone(),
-            label: node.label.clone(),
-            motion: node.report.clone(),
-            seconds: node.report.seconds,
-        };
-        self.nodes.iter().map(row).collect()
     }
 }

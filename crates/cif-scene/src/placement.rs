@@ -4,7 +4,7 @@ use cif_geometry::{RigidTransform, quaternion};
 use glam::DVec3;
 
 use crate::graph::{DenseMotion, Motion, Node, Part, pose_at};
-use crate::motion::{dot, quaternion_of, vector};
+use crate::vectors::{dot, quaternion_of, vector};
 
 /// Splats of a node at one time; parallel to [`Node::splats`].
 #[derive(Clone, Debug, Default, PartialEq)]
