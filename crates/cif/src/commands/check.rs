@@ -106,7 +106,12 @@ pub(super) fn run(command: &Check) -> Result<(), Error> {
         ),
         format!(
             "repair it into a new file: {}",
-            super::command_line(&["check", &command.scene.to_string_lossy(), "--fix", "repaired.cif"])
+            crate::commands::shared::command_line(&[
+                "check",
+                &command.scene.to_string_lossy(),
+                "--fix",
+                "repaired.cif"
+            ])
         ),
     ))
 }
@@ -194,7 +199,7 @@ fn print(command: &Check, gaussians: usize, findings: &[Finding], repairs: &[Rep
         println!("{}: {gaussians} Gaussians, nothing broken and nothing odd", command.scene.display());
     } else {
         println!("{}: {gaussians} Gaussians", command.scene.display());
-        let mut table = super::table(["", "check", "array", "count", "first", "meaning"]);
+        let mut table = crate::commands::shared::table(["", "check", "array", "count", "first", "meaning"]);
         for finding in findings {
             let first: Vec<String> = finding.first.iter().map(usize::to_string).collect();
             let severity = serde_json::to_value(finding.severity).unwrap_or(Value::Null);

@@ -54,7 +54,7 @@ pub(super) fn print_objects(changes: &SceneDiff) {
         println!("no differences in {} objects", changes.unchanged);
         return;
     }
-    let mut table = super::table(["object", "label", "change"]);
+    let mut table = crate::commands::shared::table(["object", "label", "change"]);
     for object in &changes.objects {
         for (line, words) in object.describe().into_iter().enumerate() {
             let named = |text: &str| if line == 0 { text.to_owned() } else { String::new() };

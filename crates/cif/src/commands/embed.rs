@@ -13,7 +13,8 @@ use cif_vision::{Models, library};
 use clap::Args;
 use serde_json::json;
 
-use super::{CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings, shared::scene};
+use super::shared::scene;
+use crate::commands::shared::{CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings};
 use crate::error::Error;
 use crate::formats;
 use crate::instance_views::{Coverage, cut_out};
@@ -122,7 +123,7 @@ pub(super) fn run(command: &Embed) -> Result<(), Error> {
         json!({ "scene": target, "model": name, "instances": views.collect::<Vec<_>>() })
     };
     command.report.give(report, || {
-        let mut table = super::table(["id", "label", "views"]);
+        let mut table = crate::commands::shared::table(["id", "label", "views"]);
         for (instance, views) in &views {
             table.add_row([instance.id.to_string(), instance.label.clone(), views.to_string()]);
         }

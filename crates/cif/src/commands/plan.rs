@@ -6,7 +6,7 @@ use cif_train::{EffectChoice, EffectPlan, TrainConfig};
 use clap::Args;
 use serde_json::json;
 
-use super::{CaptureOptions, print_warnings};
+use crate::commands::shared::{CaptureOptions, print_warnings};
 use crate::error::Error;
 use crate::report::OnlyReport;
 
@@ -46,7 +46,7 @@ pub(super) fn run(command: &Plan) -> Result<(), Error> {
 }
 
 fn print(plan: &EffectPlan) {
-    let mut table = super::table(["effect", "decision", "evidence", "cost", "otherwise"]);
+    let mut table = crate::commands::shared::table(["effect", "decision", "evidence", "cost", "otherwise"]);
     for effect in &plan.effects {
         table.add_row([
             effect.effect.name(),

@@ -25,7 +25,8 @@ use clap::Args;
 use serde_json::json;
 
 use crate::commands::shared::trajectories::Trajectories;
-use crate::commands::{CaptureOptions, eval::motion, print_warnings, train};
+use crate::commands::shared::{CaptureOptions, print_warnings};
+use crate::commands::{eval::motion, train};
 use crate::error::Error;
 use crate::lock::Lock;
 use crate::pictures::{Picture, instance_picture, rgb_picture};

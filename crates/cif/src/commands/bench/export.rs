@@ -94,8 +94,9 @@ fn name_of(tolerance: Tolerance) -> String {
 }
 
 fn print_ladder(rungs: &[Rung]) {
-    let mut table =
-        crate::commands::table(["tolerance", "format", "object"].into_iter().chain(motion_table::HEADINGS));
+    let mut table = crate::commands::shared::table(
+        ["tolerance", "format", "object"].into_iter().chain(motion_table::HEADINGS),
+    );
     for rung in rungs {
         let others =
             rung.files.iter().filter_map(|file| Some((file.format, &file.simplified.as_ref()?.nodes)));
@@ -112,7 +113,7 @@ fn print_ladder(rungs: &[Rung]) {
         }
     }
     println!("{table}\n");
-    let mut table = crate::commands::table([
+    let mut table = crate::commands::shared::table([
         "tolerance",
         "static",
         "rigid",

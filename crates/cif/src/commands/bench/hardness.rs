@@ -9,7 +9,8 @@ use cif_train::{Stop, TrainConfig};
 use clap::Args;
 use serde_json::json;
 
-use crate::commands::{CaptureOptions, print_warnings, train};
+use crate::commands::shared::{CaptureOptions, print_warnings};
+use crate::commands::train;
 use crate::error::Error;
 use crate::report::Report;
 use crate::settings::Layers;
@@ -184,7 +185,7 @@ fn tell(row: &Row) {
 }
 
 fn write_report(command: &BenchHardness, config: &TrainConfig, rows: &[Row]) -> Result<(), Error> {
-    let mut table = crate::commands::table([
+    let mut table = crate::commands::shared::table([
         "variant",
         "verdict",
         "PSNR",

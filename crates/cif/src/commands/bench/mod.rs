@@ -23,7 +23,8 @@ use cif_train::{InstancePass, Stage, StepTimes, Stop, TrainConfig, Trainer};
 use clap::{Args, Subcommand, ValueEnum};
 use serde_json::{Map, Value, json};
 
-use super::{CaptureOptions, Simd, print_warnings, shared::scene, train};
+use super::{Simd, shared::scene, train};
+use crate::commands::shared::{CaptureOptions, print_warnings};
 use crate::error::Error;
 use crate::output::Outputs;
 use crate::report::Report as JsonReport;
@@ -508,7 +509,7 @@ impl Report {
         );
         let costs = self.costs();
         let whole = costs.last().map_or(0.0, |(_, cost)| cost.mean);
-        let mut table = super::table(["part of a step", "ms", "median ms", "share"]);
+        let mut table = crate::commands::shared::table(["part of a step", "ms", "median ms", "share"]);
         for (name, cost) in &costs {
             let share = if whole > 0.0 { 100.0 * cost.mean / whole } else { 0.0 };
             table.add_row([
@@ -519,7 +520,7 @@ impl Report {
             ]);
         }
         println!("{table}\n");
-        let mut table = super::table(["work", "per step", "ns each", "of"]);
+        let mut table = crate::commands::shared::table(["work", "per step", "ns each", "of"]);
         // What was not counted, or not done, has no line.
         for unit in self.units().into_iter().filter(|unit| unit.ns_each.is_some()) {
             table.add_row([
@@ -541,7 +542,7 @@ impl Report {
         if self.series.iter().all(|series| series.without.is_empty()) {
             return;
         }
-        let mut table = super::table([
+        let mut table = crate::commands::shared::table([
             "instances",
             "raster ms without",
             "with instance pass",

@@ -7,7 +7,7 @@ use cif_capture::masks::Masks;
 use cif_capture::structure::Verdict;
 
 use super::{Capture, Posed, scene_name};
-use crate::commands::command_line;
+use crate::commands::shared::command_line;
 use crate::error::Error;
 
 /// Prints the report.

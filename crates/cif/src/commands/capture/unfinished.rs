@@ -9,7 +9,7 @@ use cif_capture::unfinished::{Unfinished, keep as keep_unfinished};
 
 use super::options::{LensesName, OrderName, UpName};
 use super::{Capture, Left};
-use crate::commands::command_line;
+use crate::commands::shared::command_line;
 use crate::error::Error;
 
 /// Keeps frames of videos, and poses that are `left`, and says how to go on with them and with the features

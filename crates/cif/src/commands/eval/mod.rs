@@ -10,7 +10,8 @@ use cif_train::heads::Decoder;
 use cif_train::metrics::{Evaluation, EvaluationError, EvaluationOptions, FrameView, evaluate};
 use clap::{Args, ValueEnum};
 
-use super::{CaptureOptions, Simd, print_misfits, print_warnings, shared::scene};
+use super::{Simd, shared::scene};
+use crate::commands::shared::{CaptureOptions, print_misfits, print_warnings};
 use crate::error::Error;
 use crate::evaluation::{label_of, report_of};
 use crate::messages::outcome;
@@ -166,7 +167,7 @@ fn panel(view: &FrameView<'_>) -> Picture {
 }
 
 fn print_table(evaluation: &Evaluation, field: &Field) {
-    let mut table = super::table([
+    let mut table = crate::commands::shared::table([
         "",
         "frames",
         "PSNR",
@@ -199,8 +200,9 @@ fn print_table(evaluation: &Evaluation, field: &Field) {
     }
     println!("{table}");
     if !evaluation.overall.instance.instances.is_empty() {
-        let mut table =
-            super::table(["id", "instance", "frames", "IoU", "mIoU", "accuracy", "tube IoU", "switches"]);
+        let mut table = crate::commands::shared::table([
+            "id", "instance", "frames", "IoU", "mIoU", "accuracy", "tube IoU", "switches",
+        ]);
         for score in &evaluation.overall.instance.instances {
             table.add_row([
                 score.id.to_string(),

@@ -64,7 +64,7 @@ impl Motion {
 
     /// Prints the rows.
     pub(in crate::commands) fn print(&self) {
-        let mut table = crate::commands::table(HEADINGS);
+        let mut table = crate::commands::shared::table(HEADINGS);
         table.add_rows(self.rows());
         println!("{table}");
         println!("motion of followed points, as exported by default; measured in {:.1} s", self.seconds);

@@ -17,7 +17,8 @@ use super::preset::Preferred;
 use super::targets::{Target, Targets, Writing};
 use crate::commands::eval::number;
 use crate::commands::query::code_at;
-use crate::commands::{CaptureOptions, print_misfits, print_warnings, shared::scene};
+use crate::commands::shared::scene;
+use crate::commands::shared::{CaptureOptions, print_misfits, print_warnings};
 use crate::error::Error;
 use crate::output::Outputs;
 use crate::{formats, interrupt};
@@ -349,7 +350,7 @@ impl Finding {
 
 fn print_likeness(found: &Likeness, field: &Field) {
     println!("against pictures of the scene, {} views of its cameras:", found.views);
-    let mut table = crate::commands::table(["object", "PSNR, dB", "IoU"]);
+    let mut table = crate::commands::shared::table(["object", "PSNR, dB", "IoU"]);
     table.add_row(["all, mean".to_owned(), decibels(found.psnr), number(found.miou, 2)]);
     for object in &found.objects {
         table.add_row([label(field, object.id), decibels(object.psnr), number(object.iou, 2)]);
@@ -359,7 +360,7 @@ fn print_likeness(found: &Likeness, field: &Field) {
 
 fn print_held_out(found: &HeldOutLoss, field: &Field) {
     println!("against {} held-out images:", found.field.frames);
-    let mut table = crate::commands::table([
+    let mut table = crate::commands::shared::table([
         "object",
         "PSNR of scene",
         "of file",

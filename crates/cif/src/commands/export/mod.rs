@@ -222,8 +222,9 @@ fn options(command: &Export, preferred: &Preferred, field: &Field) -> SceneOptio
 }
 
 fn print_motion(graph: &SceneGraph, masses: &[Mass]) {
-    let mut table =
-        super::table(["object", "label", "splats", "kg"].into_iter().chain(motion_table::HEADINGS));
+    let mut table = crate::commands::shared::table(
+        ["object", "label", "splats", "kg"].into_iter().chain(motion_table::HEADINGS),
+    );
     for (row, mass) in graph.motion_table().iter().zip(masses) {
         let kilograms = mass.kilograms.map_or_else(String::new, |mass| format!("{mass:.3}"));
         let object = [row.name.clone(), row.label.clone(), row.motion.gaussians.to_string(), kilograms];
@@ -237,7 +238,7 @@ fn print_errors(errors: &[MotionError]) {
         println!("no static or rigid object of the known motion is in the scene");
         return;
     }
-    let mut table = super::table([
+    let mut table = crate::commands::shared::table([
         "id",
         "label",
         "truth",

@@ -18,7 +18,8 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::shared::object_motion::ObjectMotion;
-use super::{CaptureOptions, shared::scene};
+use super::shared::scene;
+use crate::commands::shared::CaptureOptions;
 use crate::error::Error;
 use crate::formats;
 use crate::report::OnlyReport;
@@ -215,8 +216,16 @@ fn print_curve(curve: &Value) {
         curve.frames.describe(),
         curve.measuring.wall_s
     );
-    let mut table =
-        super::table(["stage", "step", "wall s", "CPU s", "Gaussians", "PSNR dB", "SSIM", "mIoU %"]);
+    let mut table = crate::commands::shared::table([
+        "stage",
+        "step",
+        "wall s",
+        "CPU s",
+        "Gaussians",
+        "PSNR dB",
+        "SSIM",
+        "mIoU %",
+    ]);
     let number = |value: Option<f64>, digits| value.map_or("n/a".to_owned(), |v| format!("{v:.digits$}"));
     for point in &curve.points {
         table.add_row([

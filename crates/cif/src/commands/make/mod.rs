@@ -11,7 +11,8 @@ use clap::{Args, Parser};
 use serde_json::json;
 
 use self::record::{Record, State};
-use super::{Arguments, command_line, dispatch};
+use super::{Arguments, dispatch};
+use crate::commands::shared::command_line;
 use crate::error::Error;
 use crate::report::OnlyReport;
 

@@ -8,7 +8,7 @@ use cif_dataset::{Dataset, InstanceLabel, OpenOptions};
 use clap::{Args, ValueEnum};
 use serde_json::json;
 
-use crate::commands::{LayoutName, command_line, table};
+use crate::commands::shared::{LayoutName, command_line, table};
 use crate::error::Error;
 use crate::interrupt;
 use crate::progress::FrameProgress;

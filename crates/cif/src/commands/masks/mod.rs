@@ -9,7 +9,7 @@ use cif_dataset::masks::{INDEX_FILE, ViewOrder, ZigzagIndex, split_tracker_masks
 use clap::{Args, Subcommand, ValueEnum};
 use serde_json::json;
 
-use super::{CaptureOptions, print_warnings};
+use crate::commands::shared::{CaptureOptions, print_warnings};
 use crate::error::Error;
 use crate::report::OnlyReport;
 

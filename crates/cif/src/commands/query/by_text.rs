@@ -138,7 +138,7 @@ fn report(command: &Query, scored: &[Scored]) -> Result<(), Error> {
 }
 
 fn print(scored: &[Scored]) {
-    let mut table = crate::commands::table(["", "score", "object", "label", "class", "position"]);
+    let mut table = crate::commands::shared::table(["", "score", "object", "label", "class", "position"]);
     for Scored { object, score, chosen } in scored {
         let rows = &object.found.transform;
         table.add_row([

@@ -334,7 +334,7 @@ fn at(command: &Query, place: DVec3) -> Result<(), Error> {
 }
 
 fn print_table(found: &[ObjectMatch]) {
-    let mut table = super::table([
+    let mut table = crate::commands::shared::table([
         "object",
         "label",
         "class",

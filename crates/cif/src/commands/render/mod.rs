@@ -22,8 +22,9 @@ use clap::{ArgGroup, Args, ValueEnum};
 
 use super::eval::SplitName;
 use super::shared::trajectories::Trajectories;
-use super::{CaptureOptions, Simd, print_misfits, print_warnings, shared::scene};
+use super::{Simd, shared::scene};
 use crate::camera_file::{self, FORMAT_HELP, View};
+use crate::commands::shared::{CaptureOptions, print_misfits, print_warnings};
 use crate::error::Error;
 use crate::messages::outcome;
 use crate::moment::Moment;

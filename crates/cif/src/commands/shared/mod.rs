@@ -3,15 +3,27 @@
 //! | module | answers |
 //! |---|---|
 //! | [`asked`] | what a detector's masks show of a scene |
+//! | [`capture`] | which capture is read, and how |
+//! | [`command_line`] | how a command is pasted into a shell |
 //! | [`model_options`] | how motion models are chosen on the command line |
 //! | [`motion_table`] | what motion reports show in tables |
 //! | [`object_motion`] | how an object of a scene moves |
 //! | [`scene`] | how scenes are read, and how they were trained |
+//! | [`table`] | how tables look |
 //! | [`trajectories`] | which lines the paths of moving objects are in a view |
 
 pub(in crate::commands) mod asked;
+pub(in crate::commands) mod capture;
+pub(in crate::commands) mod command_line;
 pub(in crate::commands) mod model_options;
 pub(in crate::commands) mod motion_table;
 pub(in crate::commands) mod object_motion;
 pub(crate) mod scene;
+pub(in crate::commands) mod table;
 pub(in crate::commands) mod trajectories;
+
+pub(in crate::commands) use capture::{
+    CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings,
+};
+pub(in crate::commands) use command_line::command_line;
+pub(in crate::commands) use table::table;

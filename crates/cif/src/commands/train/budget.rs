@@ -10,7 +10,7 @@ use cif_train::fit::{Choice, Workload, calibrate, choose, share_of_fits};
 use cif_train::{Clock, Phase, Phases, Seconds, Stop, SystemClock, TrainConfig, Trainer};
 use clap::{Args, ValueEnum};
 
-use crate::commands::CaptureOptions;
+use crate::commands::shared::CaptureOptions;
 use crate::error::Error;
 use crate::progress::duration;
 
@@ -224,7 +224,7 @@ fn tell(budget: &Budget, choice: &Choice, base: &TrainConfig, measured: usize) {
         return;
     }
     let heading = if choice.expected_s < choice.base_s { "given up" } else { "added" };
-    let mut table = crate::commands::table([heading, name, "now, about"]);
+    let mut table = crate::commands::shared::table([heading, name, "now, about"]);
     for change in &choice.changes {
         table.add_row([change.setting.to_owned(), change.from.clone(), change.to.clone()]);
     }

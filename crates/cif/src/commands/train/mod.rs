@@ -16,7 +16,8 @@ use cif_train::{
 use clap::builder::PossibleValue;
 use clap::{Args, ValueEnum};
 
-use super::{CaptureOptions, Simd, command_line, print_warnings, shared::scene};
+use super::{Simd, shared::scene};
+use crate::commands::shared::{CaptureOptions, command_line, print_warnings};
 use crate::destination::{Destination, Existing};
 use crate::error::Error;
 use crate::output::Outputs;

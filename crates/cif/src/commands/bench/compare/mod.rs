@@ -20,8 +20,8 @@ use clap::Args;
 
 use self::describe::describe;
 use self::runs::{Bench, Ended};
+use crate::commands::shared::{CaptureOptions, print_warnings};
 use crate::commands::train::{self, HeadArgument};
-use crate::commands::{CaptureOptions, print_warnings};
 use crate::error::Error;
 use crate::settings::Layers;
 use crate::{interrupt, output};

@@ -15,7 +15,7 @@ use clap::Args;
 use serde_json::json;
 
 use self::points::Points;
-use crate::commands::{FrameOptions, LayoutName, command_line};
+use crate::commands::shared::{FrameOptions, LayoutName, command_line};
 use crate::error::Error;
 use crate::interrupt;
 use crate::pictures::{ContactSheet, save_jpeg};

@@ -13,9 +13,8 @@ use clap::{Args, ValueEnum};
 
 use super::Query;
 use crate::commands::shared::asked::{self, AskedScene};
-use crate::commands::{
-    CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings, shared::scene,
-};
+use crate::commands::shared::scene;
+use crate::commands::shared::{CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings};
 use crate::detector::Detector;
 use crate::error::Error;
 use crate::formats;

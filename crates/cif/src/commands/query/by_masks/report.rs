@@ -47,7 +47,7 @@ fn print(command: &Query, answer: &Answer) {
     if found.votes.iter().all(|vote| !vote.chosen) {
         println!("no instance lies inside the masks of {asked}");
     }
-    let mut table = crate::commands::table(["", "id", "label", "class", "inside"]);
+    let mut table = crate::commands::shared::table(["", "id", "label", "class", "inside"]);
     for vote in &found.votes {
         table.add_row([
             if vote.chosen { "*".to_owned() } else { String::new() },
