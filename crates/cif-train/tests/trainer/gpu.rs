@@ -308,6 +308,7 @@ fn a_run_goes_on_on_either_backend() {
 }
 
 #[test]
+#[ignore = "long: make test-long"]
 fn interrupted_runs_on_a_gpu_end_where_uninterrupted_ones_end() {
     let Some(gpu) = testing::gpu() else { return };
     let folder = tempfile::tempdir().unwrap();
