@@ -21,8 +21,8 @@ const MAX_WORKGROUP_BYTES: u32 = 16_384;
 const MAX_INVOCATIONS: u32 = 256;
 
 /// Checks that a module is valid WGSL, without any optional feature and in the form with subgroups, that its bindings
-/// make a layout, that its entry points are the listed ones, that structures lie as in Rust, that every entry point keeps to the core
-/// limits of WebGPU, and that Metal and Direct3D can be given it.
+/// make a layout, that its entry points are the listed ones, that structures lie as in Rust, that every entry point
+/// keeps to the core limits of WebGPU, and that Metal and Direct3D can be given it.
 ///
 /// # Errors
 /// With everything that is wrong, a line each.
