@@ -60,6 +60,15 @@ pub enum TrainEvent {
         /// Gaussians.
         gaussians: usize,
     },
+    /// A stage is complete.
+    StageEnded {
+        /// Stage.
+        stage: Stage,
+        /// Time that it took, with everything inside it and over interruptions, seconds.
+        wall_s: f64,
+        /// Gaussians.
+        gaussians: usize,
+    },
     /// Steps were done; sent every `report.step_every` steps.
     Step {
         /// Stage.

@@ -131,7 +131,9 @@ impl Phase {
 impl From<Stage> for Phase {
     fn from(stage: Stage) -> Self {
         match stage {
+            Stage::Search => Self::Search,
             Stage::Coarse => Self::Coarse,
+            Stage::Objects => Self::Objects,
             Stage::Fine => Self::Fine,
             Stage::Identity => Self::Identity,
             Stage::Instance => Self::Instance,

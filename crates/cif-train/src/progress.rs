@@ -29,6 +29,9 @@ pub(crate) struct Progress {
     /// Processor time per phase, all threads together, seconds.
     #[serde(default)]
     pub cpu_s: BTreeMap<String, f64>,
+    /// Wall time per stage, with everything inside it, seconds.
+    #[serde(default)]
+    pub stages_s: BTreeMap<String, f64>,
     /// Quality over the run, as measured so far.
     #[serde(default)]
     pub curve: Curve,
@@ -161,6 +164,7 @@ impl Progress {
             steps: BTreeMap::new(),
             wall_s: BTreeMap::new(),
             cpu_s: BTreeMap::new(),
+            stages_s: BTreeMap::new(),
             curve: Curve::default(),
             goals: Goals::default(),
             sh_start: 0,
@@ -182,6 +186,11 @@ impl Progress {
     pub(crate) fn add_psnr(&mut self, psnr: f64) {
         let psnr = psnr.min(MAX_PSNR);
         self.psnr = Some(self.psnr.map_or(psnr, |mean| mean + PSNR_SHARE * (psnr - mean)));
+    }
+
+    /// Adds time of a stage, seconds.
+    pub(crate) fn add_stage_s(&mut self, stage: Stage, wall_s: f64) {
+        *self.stages_s.entry(stage.name().to_owned()).or_default() += wall_s;
     }
 
     /// The same with the time of this process.

@@ -57,12 +57,26 @@ impl Stages {
         }
     }
 
+    /// True where Gaussians are held to paths of objects, or in place: without masks nobody knows what may be.
+    pub(crate) fn are_guided(self, config: &TrainConfig) -> bool {
+        let is_asked = config.motion.guidance > 0.0 || config.motion.stillness > 0.0;
+        is_asked && self.is_dynamic && self.has_instances
+    }
+
+    /// True where objects are tried for motion before the first step.
+    pub(crate) fn search(self, config: &TrainConfig) -> bool {
+        let has_steps = [Stage::Coarse, Stage::Fine].iter().any(|stage| self.iterations(config, *stage) > 0);
+        config.motion.guidance > 0.0 && self.are_guided(config) && has_steps
+    }
+
     /// The first stage with something to do from `stage` on.
     pub(crate) fn from(self, config: &TrainConfig, stage: Stage) -> Stage {
-        [Stage::Coarse, Stage::Fine, Stage::Identity, Stage::Instance]
+        [Stage::Search, Stage::Coarse, Stage::Objects, Stage::Fine, Stage::Identity, Stage::Instance]
             .into_iter()
             .filter(|candidate| *candidate >= stage)
             .find(|candidate| match candidate {
+                Stage::Search => self.search(config),
+                Stage::Objects => self.are_guided(config) && self.iterations(config, Stage::Fine) > 0,
                 Stage::Identity => self.has_instances,
                 _ => self.iterations(config, *candidate) > 0,
             })
@@ -72,7 +86,9 @@ impl Stages {
     /// The stage after `stage`.
     pub(crate) fn after(self, config: &TrainConfig, stage: Stage) -> Stage {
         let next = match stage {
-            Stage::Coarse => Stage::Fine,
+            Stage::Search => Stage::Coarse,
+            Stage::Coarse => Stage::Objects,
+            Stage::Objects => Stage::Fine,
             Stage::Fine => Stage::Identity,
             Stage::Identity => Stage::Instance,
             Stage::Instance | Stage::Done => Stage::Done,

@@ -15,6 +15,7 @@ use crate::error::TrainError;
 use crate::frames::{FrameStore, TrainFrame};
 use crate::guidance::{Guidance, Pulls};
 use crate::heads::{self, Head, HeadTensors, Pass, Target, ValueHead};
+use crate::objects::KnownObjects;
 use crate::optimiser::Optimiser;
 use crate::phases::Phases;
 use crate::poses::PoseMoments;
@@ -40,6 +41,8 @@ pub(crate) struct State {
     /// Sums for densification.
     pub statistics: DensifyStatistics,
     pub progress: Progress,
+    /// Fits of objects, until the field takes them over.
+    pub objects: KnownObjects,
     /// Paths that Gaussians are held to.
     pub guidance: Guidance,
     /// Gaussians whose identity row is not from their own label mass.
@@ -52,7 +55,7 @@ pub(crate) struct State {
     pub times: StepTimes,
 }
 
-/// A copy of what steps and changes of the set of Gaussians change.
+/// A copy of what steps and changes of the set of Gaussians change; what was found about objects stays known.
 pub(crate) struct Kept {
     field: Field,
     optimiser: Optimiser,

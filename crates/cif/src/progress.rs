@@ -110,12 +110,15 @@ impl Progress {
                 self.last_line = None;
                 let (done, total) = (u64::from(*iteration), u64::from(*iterations));
                 self.show(Shown { prefix: stage.name(), done, total, message: String::new() });
-                // Identity estimation has no steps and reports its result itself.
+                // Stages without steps report what they find.
                 if *iterations > 0 {
                     self.plain(&format!(
                         "{stage}: {iterations} steps from step {iteration}, {gaussians} Gaussians"
                     ));
                 }
+            }
+            TrainEvent::StageEnded { stage, wall_s, .. } => {
+                self.plain(&format!("{stage} took {}", duration(*wall_s)));
             }
             TrainEvent::Step {
                 stage,

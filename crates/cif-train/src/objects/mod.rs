@@ -18,12 +18,14 @@
 //! | `bend` | whether it rather deforms |
 //! | `start` | everything in order |
 //! | `parts` | which part of it turns on a hinge or slides |
+//! | `known` | what was found of all objects, saved with the run |
 
 mod ball;
 mod below;
 mod bend;
 mod fit;
 mod follow;
+mod known;
 mod mend;
 mod order;
 mod outline;
@@ -47,6 +49,7 @@ use cif_dataset::{Dataset, Split};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
+pub(crate) use self::known::KnownObjects;
 pub(crate) use self::order::Order;
 pub(crate) use self::parts::Jointed;
 pub(crate) use self::plane::Plane;

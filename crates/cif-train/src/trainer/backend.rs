@@ -123,8 +123,12 @@ mod on_gpu {
         pub fn use_faster(&mut self, gpu: &Gpu) -> Result<Probe, TrainError> {
             self.engine = Box::new(Processor::new(self.simd));
             let (kept, loss, messages) = (self.state.keep(), self.last_loss, self.messages.len());
-            let stage = self.state.progress.stage;
-            let probed = self.probe(gpu);
+            let stage = match self.state.progress.stage {
+                // Fits leave no other steps to try.
+                Stage::Search | Stage::Objects => Stage::Coarse,
+                stage => stage,
+            };
+            let probed = self.probe(gpu, stage);
             self.state.put_back(kept);
             self.last_loss = loss;
             self.messages.truncate(messages);
@@ -137,12 +141,13 @@ mod on_gpu {
             probe
         }
 
-        /// Seconds of a step on either, at the head of the present stage.
-        fn probe(&mut self, gpu: &Gpu) -> Result<(f64, f64), TrainError> {
-            if !matches!(self.state.progress.stage, Stage::Coarse | Stage::Fine | Stage::Instance) {
+        /// Seconds of a step of a stage on either.
+        fn probe(&mut self, gpu: &Gpu, stage: Stage) -> Result<(f64, f64), TrainError> {
+            if !stage.has_steps() {
                 // No step is left to compare; whatever is taken has nothing to do.
                 return Ok((0.0, 0.0));
             }
+            self.state.progress.stage = stage;
             let before = self.state.keep();
             let on_processor = self.time_of_steps()?;
             self.state.put_back(before);

@@ -12,12 +12,11 @@ const TRAVELS: f64 = 7.0;
 impl Trainer {
     /// Travelling objects that are not fitted yet.
     pub(super) fn objects_to_fit(&self) -> usize {
-        if !self.state.config.motion.rigid || !self.is_guided() {
+        if !self.state.config.motion.rigid || !self.stages.are_guided(&self.state.config) {
             return 0;
         }
         let travelling = self.state.guidance.travelling.iter().enumerate().filter(|(_, travels)| **travels);
-        let is_open = |label: u16| !self.fits.contains_key(&label) && !self.jointed.contains_key(&label);
-        travelling.filter(|(label, _)| is_open(*label as u16)).count()
+        travelling.filter(|(label, _)| !self.state.objects.has_poses(*label as u16)).count()
     }
 
     /// Estimated seconds to the end of the run, within a stage whose steps are done at a rate per second: the budget's
@@ -47,7 +46,7 @@ impl Trainer {
     fn fits_s(&self) -> f64 {
         let others = self.state.guidance.travelling.iter().skip(1).filter(|travels| !**travels).count();
         // In units of fits of objects that rest.
-        let tried = others as f64 + TRAVELS * self.fits.len() as f64;
+        let tried = others as f64 + TRAVELS * self.state.objects.moving_count() as f64;
         let spent = self.state.phases.spent(Phase::Search).wall_s;
         if tried > 0.0 { TRAVELS * self.objects_to_fit() as f64 * spent / tried } else { 0.0 }
     }

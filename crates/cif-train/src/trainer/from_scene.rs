@@ -55,7 +55,7 @@ impl Trainer {
         if let Some(training) = training {
             let parsed = SavedState::parse(training.json)?;
             match parsed.progress.stage {
-                stage @ (Stage::Coarse | Stage::Fine) => {
+                stage if stage < Stage::Identity => {
                     return Err(TrainError::Unfinished { scene: name.to_owned(), stage });
                 }
                 Stage::Identity => {

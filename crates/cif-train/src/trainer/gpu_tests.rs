@@ -62,6 +62,9 @@ fn host(trainer: &Trainer) -> (Field, Optimiser, DensifyStatistics, Exposures) {
 
 /// One step, and what it told.
 pub(super) fn step(trainer: &mut Trainer) -> (Result<(), TrainError>, Vec<TrainEvent>) {
+    if trainer.stage() == Stage::Search {
+        trainer.enter(Stage::Coarse).unwrap();
+    }
     let mut events = Vec::new();
     let result = trainer.step(&mut events).map(drop);
     (result, events)

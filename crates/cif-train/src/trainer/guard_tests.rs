@@ -30,6 +30,9 @@ fn state(trainer: &Trainer) -> (Field, Optimiser) {
 
 /// One step, and what it told.
 fn step(trainer: &mut Trainer) -> (Result<(), TrainError>, Vec<TrainEvent>) {
+    if trainer.stage() == Stage::Search {
+        trainer.enter(Stage::Coarse).unwrap();
+    }
     let mut events = Vec::new();
     let result = trainer.step(&mut events).map(drop);
     (result, events)

@@ -30,20 +30,8 @@ const OPACITY: f32 = 0.4;
 const OUTSIDE: f64 = 0.15;
 
 impl Trainer {
-    pub(super) fn is_guided(&self) -> bool {
-        // Without masks nobody knows what may be held in place.
-        let is_asked = self.state.config.motion.guidance > 0.0 || self.state.config.motion.stillness > 0.0;
-        is_asked && self.stages.is_dynamic && self.stages.has_instances
-    }
-
-    /// Finds out which instances travel, once in a run that is not beyond the coarse stage.
+    /// Finds out which instances travel: the work of the search stage.
     pub(super) fn find_travelling(&mut self) -> Result<(), TrainError> {
-        if self.is_searched || self.state.progress.stage != Stage::Coarse {
-            return Ok(());
-        }
-        if self.state.config.motion.guidance <= 0.0 || !self.is_guided() {
-            return Ok(());
-        }
         let observations = self.observe(false)?;
         self.state.guidance.travelling = std::iter::once(false)
             .chain(observations.iter().map(|observations| travels(observations)))
@@ -57,7 +45,7 @@ impl Trainer {
             let message = format!("guided by their masks: {}", names.join(", "));
             self.messages.push(TrainEvent::note(message));
         }
-        self.is_searched = true;
+        self.state.objects.is_searched = true;
         Ok(())
     }
 
@@ -116,7 +104,7 @@ impl Trainer {
 
     /// Estimates paths, gives travelling objects Gaussians of their own, and teaches the deformation.
     pub(super) fn start_guidance(&mut self) -> Result<(), TrainError> {
-        if !self.is_guided() {
+        if !self.stages.are_guided(&self.state.config) {
             return Ok(());
         }
         self.state.guidance.guide_of = vec![0; self.state.field.gaussians.len()];

@@ -9,7 +9,7 @@ use glam::{DQuat, DVec3};
 use super::Trainer;
 use super::guard_tests::support::{Scene, capture, small_config, stopped_after};
 use super::objects::is_rigid;
-use crate::objects::Fitted;
+use crate::objects::{Fitted, Found};
 use crate::stage::Stage;
 
 /// An object without poses yet, which is explained in full.
@@ -77,7 +77,7 @@ fn paths_hold_no_object_that_has_poses() {
         reference: pose,
         ..told(gaussians)
     };
-    trainer.fits.insert(2, fitted);
+    trainer.state.objects.rigid.insert(2, Found::Moves(Box::new(fitted)));
     trainer.enter(Stage::Fine).unwrap();
     let guidance = &trainer.state.guidance;
     assert_eq!((guidance.guides.len(), guidance.guide_of.len()), (2, trainer.state.field.len()));
@@ -123,7 +123,7 @@ fn hidden(scene: Scene, keeps_masks: bool) -> Vec<(f64, bool)> {
         reference: pose(1.0),
         ..told(gaussians)
     };
-    trainer.fits.insert(3, fitted);
+    trainer.state.objects.rigid.insert(3, Found::Moves(Box::new(fitted)));
     trainer.enter(Stage::Fine).unwrap();
     trainer.state.field.validate().unwrap();
     let group = &trainer.state.field.tracks.as_ref().unwrap().groups[0];

@@ -44,7 +44,7 @@ impl Trainer {
         stage: Stage,
         warm_up: u32,
     ) -> Result<Self, TrainError> {
-        assert!(!matches!(stage, Stage::Identity | Stage::Done), "the {stage} stage has no steps");
+        assert!(stage.has_steps(), "the {stage} stage has no steps");
         config.validate()?;
         let measured_frames = MeasuredFrames::withhold(&mut dataset, &config);
         let is_trained = scene.is_some();

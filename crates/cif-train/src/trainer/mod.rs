@@ -12,7 +12,7 @@
 //! | `judged` | degrees of harmonics and outputs of the network that must show that they help |
 //! | `heads` | what heads of other systems see and change between steps |
 //! | `guidance` | how travelling objects start on the paths that masks tell |
-//! | `objects`, `known` | which objects move as a whole, how they join the field, and what is kept of fits until then |
+//! | `objects`, `parts` | which objects move as a whole or in a part, and how they join the field |
 //! | `identity` | how identity rows come about |
 //! | `shares` | how much of a Gaussian is of any instance |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
@@ -50,7 +50,6 @@ mod heads;
 mod identity;
 mod initialize;
 mod judged;
-mod known;
 mod measure;
 mod motions;
 mod near;
@@ -70,7 +69,7 @@ mod shares;
 mod step;
 mod still;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -84,7 +83,6 @@ pub use self::backend::Probe;
 use self::changes::Changes;
 use self::evaluate::MeasuredFrames;
 pub(crate) use self::initialize::automatic_time_nodes;
-use self::known::KnownObjects;
 pub use self::measure::InstancePass;
 use self::pacing::Pacing;
 use self::resume::SavedHead;
@@ -103,7 +101,7 @@ use crate::exposure::Exposures;
 use crate::frames::FrameStore;
 use crate::guidance::Guidance;
 use crate::heads::{Head, HeadTensors, configured};
-use crate::objects::{Fitted, Jointed};
+use crate::objects::KnownObjects;
 use crate::optimiser::Optimiser;
 use crate::phase::Phase;
 use crate::phases::Phases;
@@ -186,22 +184,12 @@ pub struct Trainer {
     pacing: Option<Pacing>,
     /// Notes and warnings not sent yet.
     messages: Vec<TrainEvent>,
-    /// True once it is known which objects travel, or that none is asked for.
-    is_searched: bool,
     /// Head of a saved run, and its arrays, until it is set.
     saved_head: Option<SavedHead>,
     /// Loss of the last step that was taken in.
     last_loss: StepLoss,
-    /// Objects that were fitted so far, until the fine stage has taken them over.
-    known: KnownObjects,
-    /// Objects that move as a whole, by label, until the fine stage gives them Gaussians.
-    fits: BTreeMap<u16, Fitted>,
-    /// Labels of objects of which nothing tells how far away they are.
-    nowhere: BTreeSet<u16>,
-    /// Labels of travelling objects for which a budget left no time.
-    left_out: BTreeSet<u16>,
-    /// Objects with a part on a joint, likewise.
-    jointed: BTreeMap<u16, Jointed>,
+    /// The stage that runs, and the time on the clock since when, seconds.
+    stage_since: Option<(Stage, f64)>,
     /// Events of steps that were taken in, not sent yet.
     arrived: Vec<TrainEvent>,
 }
@@ -222,9 +210,7 @@ impl Trainer {
         let mut trainer = Self::assemble(start, measured_frames, config, field, None)?;
         trainer.warn_of_capture();
         trainer.check_told()?;
-        let first = trainer.stages.from(&trainer.state.config, Stage::Coarse);
-        // What the fine stage begins with takes long where objects are fitted: that is left to the run.
-        let first = if first == Stage::Fine && trainer.is_guided() { Stage::Coarse } else { first };
+        let first = trainer.stages.from(&trainer.state.config, Stage::Search);
         trainer.state.progress = Progress::at(first);
         trainer.state.progress.exposures = trainer.exposures();
         trainer.enter(first)?;
@@ -292,14 +278,9 @@ impl Trainer {
             inputs: resume::inputs_of(&dataset),
             pacing: None,
             messages,
-            is_searched: false,
             saved_head: None,
             last_loss: StepLoss::default(),
-            known: KnownObjects::default(),
-            fits: BTreeMap::new(),
-            nowhere: BTreeSet::new(),
-            left_out: BTreeSet::new(),
-            jointed: BTreeMap::new(),
+            stage_since: None,
             arrived: Vec::new(),
             state: State {
                 progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),
@@ -308,6 +289,7 @@ impl Trainer {
                 head: configured(&config.head),
                 head_tensors: HeadTensors::default(),
                 statistics: DensifyStatistics::zeros(n),
+                objects: KnownObjects::default(),
                 guidance: Guidance::default(),
                 unseen: Vec::new(),
                 label_pixels: Vec::new(),
@@ -434,7 +416,7 @@ impl Trainer {
     /// True once there is something that a run begun anew would have to do again.
     #[must_use]
     pub fn has_begun(&self) -> bool {
-        self.steps_done() > 0 || self.stage() > Stage::Coarse || !self.known.is_empty()
+        self.steps_done() > 0 || self.stage() > Stage::Objects || !self.state.objects.is_empty()
     }
 
     /// Steps left in all stages.
@@ -477,7 +459,11 @@ impl Trainer {
 
     /// Progress with the time of the run so far.
     fn progress(&self) -> Progress {
-        self.state.progress.with_times(&self.state.phases.times())
+        let mut progress = self.state.progress.with_times(&self.state.phases.times());
+        if let Some((stage, since_s)) = self.stage_since {
+            progress.add_stage_s(stage, self.state.phases.now().wall_s - since_s);
+        }
+        progress
     }
 
     /// Time of the run so far, over interruptions, by name of [`Phase`]: what its phases took add up to what passed on

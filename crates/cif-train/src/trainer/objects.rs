@@ -89,10 +89,11 @@ impl Trainer {
             return Ok(());
         }
         let plane = self.support()?;
-        let (fits, left_out) = self.fit_objects(Phase::Search, &others, plane.as_ref())?;
-        for (label, fitted) in fits {
-            self.state.guidance.travelling[usize::from(label)] = true;
-            self.fits.insert(label, fitted);
+        let left_out = self.fit_objects(Phase::Search, &others, plane.as_ref())?;
+        for label in &others {
+            if self.state.objects.moving(*label).is_some() {
+                self.state.guidance.travelling[usize::from(*label)] = true;
+            }
         }
         self.note_left_out(&left_out, "taken to rest");
         self.find_parts(&others, plane.as_ref())
@@ -103,16 +104,14 @@ impl Trainer {
         let travelling = self.state.guidance.travelling.iter().enumerate().filter(|(_, travels)| **travels);
         let rest: Vec<u16> = travelling
             .map(|(label, _)| label as u16)
-            .filter(|label| !self.fits.contains_key(label) && !self.jointed.contains_key(label))
+            .filter(|label| !self.state.objects.has_poses(*label))
             .collect();
         if rest.is_empty() {
             return Ok(());
         }
         let plane = self.support()?;
-        let (fits, left_out) = self.fit_objects(Phase::Objects, &rest, plane.as_ref())?;
-        self.fits.extend(fits);
+        let left_out = self.fit_objects(Phase::Objects, &rest, plane.as_ref())?;
         self.note_left_out(&left_out, "moved by the deformation network, not by poses of their own");
-        self.left_out.extend(left_out);
         Ok(())
     }
 
@@ -210,31 +209,20 @@ impl Trainer {
         }
     }
 
-    /// Rigid motions of objects (labels: dense index + 1), fitted in a phase, without those that rest, are not rigid, or
-    /// whose masks do not show enough; and the objects that a budget left no time for.
-    #[expect(clippy::type_complexity, reason = "a list of fits and a list of labels")]
+    /// Fits rigid motions of those objects (labels: dense index + 1) of which nothing is known yet, in a phase; returns
+    /// those that a budget left no time for.
     fn fit_objects(
         &mut self,
         phase: Phase,
         labels: &[u16],
         plane: Option<&Plane>,
-    ) -> Result<(Vec<(u16, Fitted)>, Vec<u16>), TrainError> {
-        if !self.state.config.motion.rigid {
-            return Ok((Vec::new(), Vec::new()));
+    ) -> Result<Vec<u16>, TrainError> {
+        let known = &self.state.objects.rigid;
+        let unknown: Vec<u16> = labels.iter().filter(|label| !known.contains_key(*label)).copied().collect();
+        if unknown.is_empty() || !self.state.config.motion.rigid {
+            return Ok(Vec::new());
         }
-        let is_known = |label: &&u16| self.known.rigid.contains_key(*label);
-        let unknown: Vec<u16> = labels.iter().filter(|label| !is_known(label)).copied().collect();
-        let left_out =
-            if unknown.is_empty() { Vec::new() } else { self.fit_unknown(phase, &unknown, plane)? };
-        let mut fits = Vec::new();
-        for label in labels {
-            match self.known.rigid.get(label) {
-                Some(Found::Moves(fitted)) => fits.push((*label, (**fitted).clone())),
-                Some(Found::Nowhere) => drop(self.nowhere.insert(*label)),
-                Some(Found::Nothing) | None => {}
-            }
-        }
-        Ok((fits, left_out))
+        self.fit_unknown(phase, &unknown, plane)
     }
 
     /// Fits objects of which nothing is known yet, and keeps what is found, also where the run is stopped meanwhile;
@@ -271,7 +259,7 @@ impl Trainer {
         let (mut left_out, mut failed) = (Vec::new(), None);
         for (label, found) in labels.iter().zip(found) {
             match found {
-                Ok(Some(found)) => drop(self.known.rigid.insert(*label, found)),
+                Ok(Some(found)) => drop(self.state.objects.rigid.insert(*label, found)),
                 Ok(None) => left_out.push(*label),
                 Err(error) => failed = failed.or(Some(error)),
             }
@@ -283,43 +271,50 @@ impl Trainer {
     /// moves as a whole joins `posed`, with its group.
     pub(super) fn add_object(&mut self, label: u16, posed: &mut Vec<(u16, u32)>) -> bool {
         let name = self.state.field.instances[usize::from(label) - 1].label.clone();
-        let Some(fitted) = self.fits.remove(&label) else {
-            if let Some(found) = self.jointed.remove(&label) {
-                self.add_parts(name, &found);
-                return true;
-            }
-            if self.left_out.contains(&label) {
-                // That was said.
-            } else if self.nowhere.contains(&label) {
-                self.messages.push(TrainEvent::warning(format!(
-                    "{name}: depth uncertain: one camera sees it, and nothing that it stands on is known, so its size \
-                     and distance are guesses{}",
-                    match self.told(label) {
-                        Some(ObjectMotion::Rigid) =>
-                            "; it is set to be rigid, but without them it has no poses: a second camera would show them",
-                        _ => "",
-                    }
-                )));
-            } else if self.told(label) == Some(ObjectMotion::Rigid) {
-                self.messages.push(TrainEvent::warning(format!(
-                    "{name} is set to be rigid, but its poses were not found, so that the deformation network moves it: no \
-                     motion along what objects stand on, and none followed from image to image, explains its masks and \
-                     colours. What is turned in a hand before one camera is not found yet; several cameras at once, or \
-                     larger masks without gaps, show more"
-                )));
-            }
-            return false;
+        if let Some(fitted) = self.state.objects.moving(label).cloned() {
+            let how = match fitted.rotation {
+                RotationEvidence::Observed => "",
+                RotationEvidence::Assumed => ", which the pictures do not tell: assumed",
+            };
+            self.messages.push(TrainEvent::note(format!(
+                "{name} moves as a whole: {}{how} (error {:.3} on pixels left out)",
+                fitted.way, fitted.error
+            )));
+            posed.push((label, self.join(name, &fitted)));
+            return true;
+        }
+        if let Some(found) = self.state.objects.jointed(label).cloned() {
+            self.add_parts(name, &found);
+            return true;
+        }
+        self.messages.extend(self.warning_without_poses(label, &name));
+        false
+    }
+
+    /// The warning that belongs to a travelling object without poses; none where a budget left no time for them, which
+    /// was noted.
+    fn warning_without_poses(&self, label: u16, name: &str) -> Option<TrainEvent> {
+        let is_set = self.told(label) == Some(ObjectMotion::Rigid);
+        let message = match self.state.objects.rigid.get(&label) {
+            Some(Found::Nowhere) => format!(
+                "{name}: depth uncertain: one camera sees it, and nothing that it stands on is known, so its size and \
+                 distance are guesses{}",
+                if is_set {
+                    "; it is set to be rigid, but without them it has no poses: a second camera would show them"
+                } else {
+                    ""
+                }
+            ),
+            None if self.state.config.motion.rigid => return None,
+            _ if is_set => format!(
+                "{name} is set to be rigid, but its poses were not found, so that the deformation network moves it: no \
+                 motion along what objects stand on, and none followed from image to image, explains its masks and \
+                 colours. What is turned in a hand before one camera is not found yet; several cameras at once, or \
+                 larger masks without gaps, show more"
+            ),
+            _ => return None,
         };
-        let how = match fitted.rotation {
-            RotationEvidence::Observed => "",
-            RotationEvidence::Assumed => ", which the pictures do not tell: assumed",
-        };
-        self.messages.push(TrainEvent::note(format!(
-            "{name} moves as a whole: {}{how} (error {:.3} on pixels left out)",
-            fitted.way, fitted.error
-        )));
-        posed.push((label, self.join(name, &fitted)));
-        true
+        Some(TrainEvent::warning(message))
     }
 
     /// Adds the Gaussians of an object to the field, where the best of its poses puts them, in a group of their own, of

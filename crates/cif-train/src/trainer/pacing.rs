@@ -157,7 +157,7 @@ impl Trainer {
             Stage::Fine if self.stages.is_dynamic => stages.fine = steps,
             Stage::Fine => (stages.coarse, stages.fine, stages.fine_includes_coarse) = (0, steps, false),
             Stage::Instance => stages.instance = steps,
-            Stage::Identity | Stage::Done => {}
+            Stage::Search | Stage::Objects | Stage::Identity | Stage::Done => {}
         }
     }
 

@@ -19,17 +19,17 @@ impl Trainer {
         if !motion.rigid || !motion.parts {
             return Ok(());
         }
-        let is_open = |label: &u16| !self.fits.contains_key(label) && self.told(*label).is_none();
+        let known = &self.state.objects;
+        let is_open = |label: &u16| known.moving(*label).is_none() && self.told(*label).is_none();
         let wanted: Vec<u16> = labels.iter().copied().filter(is_open).collect();
-        let is_known = |label: &&u16| self.known.parts.contains_key(*label);
+        let is_known = |label: &&u16| known.parts.contains_key(*label);
         let unknown: Vec<u16> = wanted.iter().filter(|label| !is_known(label)).copied().collect();
         if !unknown.is_empty() {
             self.find_unknown_parts(&unknown, plane)?;
         }
         for label in wanted {
-            if let Some(Some(found)) = self.known.parts.get(&label) {
+            if self.state.objects.jointed(label).is_some() {
                 self.state.guidance.travelling[usize::from(label)] = true;
-                self.jointed.insert(label, found.clone());
             }
         }
         Ok(())
@@ -53,7 +53,7 @@ impl Trainer {
         let (mut left_out, mut failed) = (Vec::new(), None);
         for (label, found) in labels.iter().zip(found) {
             match found {
-                Ok(Some(found)) => drop(self.known.parts.insert(*label, found)),
+                Ok(Some(found)) => drop(self.state.objects.parts.insert(*label, found)),
                 Ok(None) => left_out.push(*label),
                 Err(error) => failed = failed.or(Some(error)),
             }

@@ -41,7 +41,7 @@ impl Trainer {
         let key = (stage, position / count);
         if self.order.as_ref().is_none_or(|(at, _)| *at != key) {
             let mut order = views;
-            let counter = (stage as u64) << 48 | key.1;
+            let counter = stream_of(stage) << 48 | key.1;
             order.shuffle(&mut stream(self.state.config.seed, Purpose::Views, counter));
             self.order = Some((key, order));
         }
@@ -210,6 +210,15 @@ impl Trainer {
         let camera = here.camera.toward(&dataset.frames[store.index(partner)].camera, f64::from(ratio));
         let masks = vec![(Arc::clone(&view.frame), weight * (1.0 - ratio)), (other, weight * ratio)];
         Ok(Some(HeadTarget { camera, time: here.time, masks }))
+    }
+}
+
+/// Number of a stage with steps in the stream that orders its views.
+fn stream_of(stage: Stage) -> u64 {
+    match stage {
+        Stage::Fine => 1,
+        Stage::Instance => 3,
+        _ => 0,
     }
 }
 

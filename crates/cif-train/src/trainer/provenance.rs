@@ -51,6 +51,7 @@ impl Trainer {
                 peak_rss_mb: peak_rss_mb(),
                 notes: members(json!({
                     "iterations_by_stage": progress.steps,
+                    "seconds_by_stage": progress.stages_s,
                     "cpu_s_by_phase": progress.cpu_s,
                     "simd": self.simd_name(),
                     "gaussians": self.state.field.gaussians.len(),

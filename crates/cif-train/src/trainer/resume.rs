@@ -12,11 +12,11 @@ use serde_json::Value;
 
 use super::Trainer;
 use super::evaluate::MeasuredFrames;
-use super::known::KnownObjects;
 use crate::config::TrainConfig;
 use crate::density::DensifyStatistics;
 use crate::error::TrainError;
 use crate::heads::{Cif, Head, HeadTensors, value_head};
+use crate::objects::KnownObjects;
 use crate::optimiser::Optimiser;
 use crate::phase::Phase;
 use crate::progress::Progress;
@@ -24,8 +24,8 @@ use crate::stage::Stage;
 use crate::state::State;
 use crate::stop::Start;
 
-/// Version of the state.
-const VERSION: u32 = 1;
+/// Version of the state. Version 1 does not hold which objects travel: they are searched anew.
+const VERSION: u32 = 2;
 
 /// The JSON part of what is saved.
 #[derive(Serialize, Deserialize)]
@@ -39,9 +39,12 @@ pub(super) struct SavedState {
     /// Name of the head that the instance stage trains.
     #[serde(default = "name_of_cif", skip_serializing_if = "is_cif")]
     head: String,
-    /// Objects that were fitted, before the fine stage takes them over.
+    /// Objects that were fitted, before the field takes them over.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     objects: Option<Value>,
+    /// Per label (dense index + 1), whether the instance travels; empty before that is known.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    travelling: Vec<bool>,
     /// Steps per parameter group.
     pub(super) adam_steps: BTreeMap<String, u32>,
 }
@@ -67,7 +70,8 @@ fn recorded<'de, D: Deserializer<'de>>(settings: D) -> Result<TrainConfig, D::Er
 
 impl SavedState {
     pub(super) fn parse(json: serde_json::Value) -> Result<Self, TrainError> {
-        if json.get("version").and_then(serde_json::Value::as_u64) != Some(u64::from(VERSION)) {
+        let version = json.get("version").and_then(serde_json::Value::as_u64);
+        if !version.is_some_and(|version| (1..=u64::from(VERSION)).contains(&version)) {
             return Err(unusable("it was written by another version of the trainer"));
         }
         let state: Self = serde_json::from_value(json).map_err(|error| unusable(error.to_string()))?;
@@ -204,7 +208,7 @@ impl Trainer {
         for (name, tensor) in self.state.pose_moments.saved() {
             tensors.insert(name.to_owned(), tensor);
         }
-        let (objects, of_objects) = self.known.saved();
+        let (objects, of_objects) = self.state.objects.saved();
         tensors.extend(of_objects);
         let state = SavedState {
             version: VERSION,
@@ -213,6 +217,7 @@ impl Trainer {
             capture: Capture::of(&self.state.dataset, &self.inputs),
             head: self.state.head.name().to_owned(),
             objects,
+            travelling: self.state.guidance.travelling.clone(),
             adam_steps,
         };
         let json = serde_json::to_value(state).expect("the state holds only strings, numbers and lists");
@@ -247,9 +252,13 @@ impl Trainer {
         trainer.restore_poses(&mut tensors)?;
         if let Some(objects) = state.objects {
             let counts = (trainer.state.field.instances.len(), trainer.state.dataset.times.len());
-            trainer.known = KnownObjects::restored(objects, &mut tensors, counts)
+            trainer.state.objects = KnownObjects::restored(objects, &mut tensors, counts)
                 .ok_or_else(|| unusable("the fitted objects do not fit the capture"))?;
         }
+        if ![0, trainer.state.field.instances.len() + 1].contains(&state.travelling.len()) {
+            return Err(unusable("the travelling objects do not fit the capture"));
+        }
+        trainer.state.guidance.travelling = state.travelling;
         let has_rows = trainer.state.field.identities.is_some();
         let unseen = counters(&mut tensors, "identity.unseen", if has_rows { n } else { 0 })?;
         trainer.state.unseen = unseen.into_iter().map(|flag| flag != 0).collect();

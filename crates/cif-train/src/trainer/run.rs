@@ -4,7 +4,6 @@ use std::sync::Arc;
 
 use cif_render::Gradients;
 
-use super::known::KnownObjects;
 use super::saving::Saving;
 use super::{Trainer, TrainerView, initialize, provenance};
 use crate::curve::MIN_GAP;
@@ -13,6 +12,7 @@ use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::events::{Control, Outcome, TrainEvent};
 use crate::heads::{self, Target};
+use crate::objects::KnownObjects;
 use crate::optimiser::Optimiser;
 use crate::phase::Phase;
 use crate::progress::{AfterStep, Progress};
@@ -73,79 +73,17 @@ impl Trainer {
         if requests.stop {
             return Ok(Outcome::Interrupted);
         }
-        self.find_travelling()?;
-        self.send_messages(observer, &mut requests);
-        loop {
-            let stage = self.state.progress.stage;
-            if stage == Stage::Done {
-                break;
-            }
-            let iterations = self.stages.iterations(&self.state.config, stage);
-            if iterations > 0 || stage == Stage::Identity {
-                let started = TrainEvent::StageStarted {
-                    stage,
-                    iteration: self.state.progress.iteration,
-                    iterations,
-                    gaussians: self.state.field.gaussians.len(),
-                };
-                requests.add(self.emit(observer, &started));
-            }
-            if stage == Stage::Identity {
-                if requests.stop || self.state.phases.is_stopped() {
-                    return Ok(Outcome::Interrupted);
-                }
-                let phase = self.state.phases.enter(stage.into(), self.state.views_of_identities().count());
-                let event = self.estimate_identities(true)?;
-                drop(phase);
-                requests.add(self.emit(observer, &event));
-                if let TrainEvent::IdentityEstimated { empty_instances, .. } = &event
-                    && !empty_instances.is_empty()
-                {
-                    let message = format!(
-                        "no Gaussian is most probably of instance {empty_instances:?}: too small, or hidden \
-                         in the frames with masks"
-                    );
-                    requests.add(self.emit(observer, &TrainEvent::Warning { message }));
-                }
-            } else {
-                let phase = self.state.phases.enter(stage.into(), iterations as usize);
-                let outcome = self.run_steps(stage, observer, &mut requests);
-                // Whatever ended the steps, the field is whole again.
-                let fetched = self.fetch();
-                drop(phase);
-                for event in std::mem::take(&mut self.arrived) {
-                    requests.add(self.emit(observer, &event));
-                }
-                if outcome? == Outcome::Interrupted {
-                    return fetched.map(|()| Outcome::Interrupted);
-                }
-                fetched?;
-                self.finish_head(stage)?;
-            }
-            let next = self.stages.after(&self.state.config, stage);
-            let ends =
-                stage == Stage::Identity || next == Stage::Done || self.state.progress.iteration >= MIN_GAP;
-            if ends {
-                match self.follow_curve(stage, true, observer, &mut requests) {
-                    // The rows are there: the run goes on behind them, without this point.
-                    Err(TrainError::Stopped) if stage == Stage::Identity => {}
-                    measured => measured?,
-                }
-            }
-            if stage == Stage::Instance {
-                // The last that may be stopped in this stage: it must not be done twice.
-                self.sharpen_shares()?;
-            }
-            self.enter(next)?;
+        if self.lacks_search() {
+            self.find_travelling()?;
             self.send_messages(observer, &mut requests);
-            if next == Stage::Done {
-                continue;
-            }
-            if requests.stop || self.state.phases.is_stopped() {
+        }
+        while self.state.progress.stage != Stage::Done {
+            let stage = self.state.progress.stage;
+            self.stage_since = Some((stage, self.now_s()));
+            let outcome = self.run_stage(stage, observer, &mut requests);
+            self.count_stage_time();
+            if outcome? == Outcome::Interrupted {
                 return Ok(Outcome::Interrupted);
-            }
-            if self.state.config.report.checkpoint_seconds > 0 {
-                self.request_checkpoint(observer, &mut requests);
             }
         }
         if let Some(message) = self.missed_targets() {
@@ -162,6 +100,136 @@ impl Trainer {
         };
         self.emit(observer, &finished);
         Ok(Outcome::Finished)
+    }
+
+    /// True of a run that goes on behind its search without what was found, as states of version 1 do.
+    fn lacks_search(&self) -> bool {
+        let is_behind = matches!(self.state.progress.stage, Stage::Coarse | Stage::Objects);
+        is_behind && self.stages.search(&self.state.config) && !self.state.objects.is_searched
+    }
+
+    /// Runs a stage, or what is left of it, and enters the next one.
+    fn run_stage(
+        &mut self,
+        stage: Stage,
+        observer: &mut Observer<'_>,
+        requests: &mut Requests,
+    ) -> Result<Outcome, TrainError> {
+        let iterations = self.stages.iterations(&self.state.config, stage);
+        if iterations > 0 || !stage.has_steps() {
+            let started = TrainEvent::StageStarted {
+                stage,
+                iteration: self.state.progress.iteration,
+                iterations,
+                gaussians: self.state.field.gaussians.len(),
+            };
+            requests.add(self.emit(observer, &started));
+        }
+        if !stage.has_steps() && (requests.stop || self.state.phases.is_stopped()) {
+            return Ok(Outcome::Interrupted);
+        }
+        match stage {
+            Stage::Search => self.find_travelling()?,
+            Stage::Objects => self.prepare_fine()?,
+            Stage::Identity => self.identify(observer, requests)?,
+            _ => {
+                if self.train_stage(stage, observer, requests)? == Outcome::Interrupted {
+                    return Ok(Outcome::Interrupted);
+                }
+            }
+        }
+        let next = self.stages.after(&self.state.config, stage);
+        self.end_stage(stage, next, observer, requests)?;
+        self.enter(next)?;
+        self.send_messages(observer, requests);
+        if next == Stage::Done {
+            return Ok(Outcome::Finished);
+        }
+        if requests.stop || self.state.phases.is_stopped() {
+            return Ok(Outcome::Interrupted);
+        }
+        if self.state.config.report.checkpoint_seconds > 0 {
+            self.count_stage_time();
+            self.request_checkpoint(observer, requests);
+        }
+        Ok(Outcome::Finished)
+    }
+
+    /// Estimates identities: the work of the identity stage.
+    fn identify(&mut self, observer: &mut Observer<'_>, requests: &mut Requests) -> Result<(), TrainError> {
+        let phase = self.state.phases.enter(Phase::Identity, self.state.views_of_identities().count());
+        let event = self.estimate_identities(true)?;
+        drop(phase);
+        requests.add(self.emit(observer, &event));
+        if let TrainEvent::IdentityEstimated { empty_instances, .. } = &event
+            && !empty_instances.is_empty()
+        {
+            let message = format!(
+                "no Gaussian is most probably of instance {empty_instances:?}: too small, or hidden in the frames with \
+                 masks"
+            );
+            requests.add(self.emit(observer, &TrainEvent::Warning { message }));
+        }
+        Ok(())
+    }
+
+    /// Trains a stage that has steps.
+    fn train_stage(
+        &mut self,
+        stage: Stage,
+        observer: &mut Observer<'_>,
+        requests: &mut Requests,
+    ) -> Result<Outcome, TrainError> {
+        let iterations = self.stages.iterations(&self.state.config, stage);
+        let phase = self.state.phases.enter(stage.into(), iterations as usize);
+        let outcome = self.run_steps(stage, observer, requests);
+        // Whatever ended the steps, the field is whole again.
+        let fetched = self.fetch();
+        drop(phase);
+        for event in std::mem::take(&mut self.arrived) {
+            requests.add(self.emit(observer, &event));
+        }
+        let outcome = outcome?;
+        fetched?;
+        if outcome == Outcome::Finished {
+            self.finish_head(stage)?;
+        }
+        Ok(outcome)
+    }
+
+    /// What follows the work of a stage, before the next one begins.
+    fn end_stage(
+        &mut self,
+        stage: Stage,
+        next: Stage,
+        observer: &mut Observer<'_>,
+        requests: &mut Requests,
+    ) -> Result<(), TrainError> {
+        let is_measured =
+            stage == Stage::Identity || next == Stage::Done || self.state.progress.iteration >= MIN_GAP;
+        if is_measured {
+            match self.follow_curve(stage, true, observer, requests) {
+                // The rows are there: the run goes on behind them, without this point.
+                Err(TrainError::Stopped) if stage == Stage::Identity => {}
+                measured => measured?,
+            }
+        }
+        if stage == Stage::Instance {
+            // The last that may be stopped in this stage: it must not be done twice.
+            self.sharpen_shares()?;
+        }
+        let wall_s = self.progress().stages_s.get(stage.name()).copied().unwrap_or(0.0);
+        let gaussians = self.state.field.gaussians.len();
+        requests.add(self.emit(observer, &TrainEvent::StageEnded { stage, wall_s, gaussians }));
+        Ok(())
+    }
+
+    /// Adds the time of the stage that ran to its progress.
+    fn count_stage_time(&mut self) {
+        if let Some((stage, since_s)) = self.stage_since.take() {
+            let spent = self.now_s() - since_s;
+            self.state.progress.add_stage_s(stage, spent);
+        }
     }
 
     /// Steps of the current stage until its end or a stop.
@@ -305,22 +373,29 @@ impl Trainer {
 
     /// Begins a stage. The run stays at the end of the stage before it when that fails or is stopped.
     pub(super) fn enter(&mut self, stage: Stage) -> Result<(), TrainError> {
-        if stage == Stage::Fine {
-            let before = (self.state.keep(), self.fits.clone(), self.jointed.clone());
-            if let Err(error) = self.prepare_fine() {
-                self.state.put_back(before.0);
-                (self.fits, self.jointed) = (before.1, before.2);
-                return Err(error);
-            }
-            self.known = KnownObjects::default();
+        // A stage of objects has made the field already.
+        if stage == Stage::Fine && self.state.progress.stage != Stage::Objects {
+            self.prepare_fine()?;
         }
         self.prepare_head(stage)?;
         self.begin(stage);
         Ok(())
     }
 
-    /// Gives the fine stage its deformation and a new optimiser (methods reference 1.3).
+    /// Makes the field that the fine stage begins with, or leaves everything as it was when that fails or is stopped:
+    /// the work of the stage of objects. Fits that were complete are kept all the same.
     fn prepare_fine(&mut self) -> Result<(), TrainError> {
+        let before = self.state.keep();
+        if let Err(error) = self.make_fine_field() {
+            self.state.put_back(before);
+            return Err(error);
+        }
+        self.state.objects = KnownObjects::default();
+        Ok(())
+    }
+
+    /// Gives the fine stage its deformation and a new optimiser (methods reference 1.3).
+    fn make_fine_field(&mut self) -> Result<(), TrainError> {
         if self.stages.is_dynamic {
             self.state.field.deformation =
                 Some(initialize::initial_deformation(&self.state.dataset, &self.state.config)?);

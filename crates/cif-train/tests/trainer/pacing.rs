@@ -42,7 +42,8 @@ fn a_budget_ends_every_stage_on_time() {
             Control::Continue
         });
         assert_eq!(outcome.unwrap(), Outcome::Finished);
-        assert_eq!(stages, [Stage::Coarse, Stage::Fine, Stage::Identity, Stage::Instance]);
+        use Stage::{Coarse, Fine, Identity, Instance, Objects, Search};
+        assert_eq!(stages, [Search, Coarse, Objects, Fine, Identity, Instance]);
         let used = budget.used(clock.now());
         assert!((54.0..=62.0).contains(&used), "{used}");
         let record = trainer.field().record.to_json()["train"].clone();

@@ -9,7 +9,7 @@ use cif_dataset::{Dataset, PointSource};
 use cif_field::Checkpoint;
 use cif_train::budget::{Budget, BudgetClock};
 use cif_train::{
-    Clock, Control, Outcome, Phase, Phases, Seconds, Start, Stop, TrainConfig, TrainError, TrainEvent,
+    Clock, Control, Outcome, Phase, Phases, Seconds, Stage, Start, Stop, TrainConfig, TrainError, TrainEvent,
     Trainer,
 };
 
@@ -151,6 +151,74 @@ fn a_stop_inside_fits_is_obeyed_at_once_and_the_run_goes_on_to_the_same_end() {
         assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
         assert!(without_record(resumed.field()) == without_record(whole.field()), "{phase}");
     }
+}
+
+/// Events of phases and stages of a run that goes on from a state.
+fn resumed_from(dataset: &Dataset, state: Checkpoint) -> (Trainer, Vec<TrainEvent>) {
+    let (phases, events) = kept(Arc::new(Ticking::default()), |_| false);
+    let mut resumed = Trainer::resume(Start { dataset: dataset.clone(), phases }, state).unwrap();
+    let outcome = resumed.run(&mut |event, _| {
+        events.lock().unwrap().push(event.clone());
+        Control::Continue
+    });
+    assert_eq!(outcome.unwrap(), Outcome::Finished);
+    let events = std::mem::take(&mut *events.lock().unwrap());
+    (resumed, events)
+}
+
+#[test]
+fn fits_of_objects_are_stages_that_a_resumed_run_does_not_repeat() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = rolling(folder.path());
+    let mut trainer = Trainer::new(Start::from(dataset.clone()), guided()).unwrap();
+    trainer.set_clock(Arc::new(Ticking::default()));
+    let (mut states, mut seconds) = (Vec::new(), Vec::new());
+    let outcome = trainer.run(&mut |event, view| {
+        match event {
+            TrainEvent::CheckpointDue { stage, .. } => states.push((*stage, view.checkpoint(true))),
+            TrainEvent::StageEnded { stage, wall_s, .. } => seconds.push((*stage, *wall_s)),
+            _ => {}
+        }
+        Control::Continue
+    });
+    assert_eq!(outcome.unwrap(), Outcome::Finished);
+    let expected = without_record(trainer.field());
+
+    use Stage::{Coarse, Fine, Identity, Instance, Objects, Search};
+    let order: Vec<Stage> = seconds.iter().map(|(stage, _)| *stage).collect();
+    assert_eq!(order, [Search, Coarse, Objects, Fine, Identity, Instance]);
+    assert!(seconds.iter().all(|(_, wall_s)| *wall_s > 0.0), "{seconds:?}");
+    let record = trainer.field().record.to_json()["train"]["seconds_by_stage"].clone();
+    assert!(
+        record["search"].as_f64().unwrap() > 0.0 && record["objects"].as_f64().unwrap() > 0.0,
+        "{record}"
+    );
+
+    let begun = |events: &[TrainEvent], phase: Phase| {
+        let is_begin =
+            |e: &TrainEvent| matches!(e, TrainEvent::PhaseStarted { phase: of, .. } if *of == phase);
+        events.iter().any(is_begin)
+    };
+    let at = |stage: Stage| states.iter().find(|(of, _)| *of == stage).unwrap().1.clone();
+    let (resumed, events) = resumed_from(&dataset, at(Coarse));
+    assert!(!begun(&events, Phase::Search) && begun(&events, Phase::Objects));
+    assert!(without_record(resumed.field()) == expected, "behind the search");
+    let (resumed, events) = resumed_from(&dataset, at(Fine));
+    for phase in [Phase::Paths, Phase::Search, Phase::Objects, Phase::Presence, Phase::Rehearsal] {
+        assert!(!begun(&events, phase), "{phase} is done again");
+    }
+    assert!(without_record(resumed.field()) == expected, "behind the fits");
+
+    // Version 1 had no stages of fits, and kept no more of them than what was fitted so far.
+    let mut old = at(Coarse);
+    let json = &mut old.training.as_mut().unwrap().json;
+    json["version"] = 1.into();
+    for key in ["objects", "travelling"] {
+        assert!(json.as_object_mut().unwrap().remove(key).is_some(), "{key} is saved");
+    }
+    let (resumed, events) = resumed_from(&dataset, old);
+    assert!(begun(&events, Phase::Search), "it searches anew");
+    assert!(without_record(resumed.field()) == expected, "from a state of version 1");
 }
 
 #[test]

@@ -46,8 +46,11 @@ fn a_run_reaches_its_quality_and_reports_its_stages() {
         })
         .unwrap();
     assert_eq!(outcome, Outcome::Finished);
-    assert_eq!(stages, [Stage::Coarse, Stage::Fine, Stage::Identity, Stage::Instance]);
-    for name in ["step", "densified", "resampled", "identity_estimated", "evaluated", "finished"] {
+    use Stage::{Coarse, Fine, Identity, Instance, Objects, Search};
+    assert_eq!(stages, [Search, Coarse, Objects, Fine, Identity, Instance]);
+    for name in
+        ["stage_ended", "step", "densified", "resampled", "identity_estimated", "evaluated", "finished"]
+    {
         assert!(names.contains(name), "{name} missing in {names:?}");
     }
     let field = trainer.into_field();
@@ -156,7 +159,8 @@ fn a_run_may_be_stopped_inside_everything_it_does() {
     });
     assert_equal(finished.unwrap().field(), whole.field());
     let at = |stage: Stage, iteration: u32| stopped.iter().any(|(s, i, _)| (*s, *i) == (stage, iteration));
-    assert!(at(Stage::Coarse, 20), "rehearsal: {stopped:?}");
+    assert!(at(Stage::Search, 0), "search: {stopped:?}");
+    assert!(at(Stage::Objects, 0), "fits and rehearsal: {stopped:?}");
     assert!(at(Stage::Identity, 0), "identities: {stopped:?}");
     let behind_steps: BTreeSet<&str> = stopped.iter().filter_map(|(_, _, after)| after.as_str()).collect();
     assert!(behind_steps.len() >= 3, "judgements and the like: {stopped:?}");

@@ -11,7 +11,7 @@ use cif_field::{Checkpoint, Field, Record};
 use cif_geometry::Bounds;
 use cif_scene::SceneOptions;
 use cif_scene::from_field::assignment::members;
-use cif_train::Curve;
+use cif_train::{Curve, Stage};
 use clap::Args;
 use glam::DVec3;
 use serde::Deserialize;
@@ -148,6 +148,10 @@ fn scene_facts(checkpoint: &Checkpoint) -> Facts {
         ("extent".to_owned(), json!(field.extent)),
         ("instances".to_owned(), json!(instances)),
         ("resumable".to_owned(), json!(checkpoint.training.is_some())),
+        (
+            "stages".to_owned(),
+            json!(field.record.run.as_ref().and_then(|run| run.notes.get("seconds_by_stage"))),
+        ),
         ("work".to_owned(), json!(field.record.run.as_ref().and_then(|run| run.notes.get("work")))),
         ("curve".to_owned(), json!(field.record.curve)),
         ("embeddings".to_owned(), json!(embeddings)),
@@ -187,12 +191,24 @@ fn print(facts: &Facts) {
             Value::Object(items) if name == "provenance" => {
                 println!("{name:>28}  {}", items.keys().cloned().collect::<Vec<_>>().join(", "));
             }
-            Value::Null if ["curve", "embeddings", "work"].contains(&name.as_str()) => {}
+            Value::Null if ["curve", "embeddings", "stages", "work"].contains(&name.as_str()) => {}
+            Value::Object(items) if name == "stages" => println!("{name:>28}  {}", stage_times(items)),
             Value::Object(items) if name == "work" => print_work(items),
             value if name == "curve" => print_curve(value),
             value => println!("{name:>28}  {}", one_line(value)),
         }
     }
+}
+
+/// Times of stages in words, in the order of a run.
+fn stage_times(times: &serde_json::Map<String, Value>) -> String {
+    let mut stages: Vec<(Option<Stage>, String)> = Vec::new();
+    for (name, seconds) in times {
+        let stage = serde_json::from_value(json!(name)).ok();
+        stages.push((stage, format!("{name} {:.1} s", seconds.as_f64().unwrap_or(0.0))));
+    }
+    stages.sort_by_key(|(stage, _)| *stage);
+    stages.into_iter().map(|(_, words)| words).collect::<Vec<_>>().join(", ")
 }
 
 /// Prints the work counts of the run.

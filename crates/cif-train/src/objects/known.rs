@@ -1,5 +1,5 @@
-//! Objects that were fitted so far: kept, and saved with the run, until the fine stage takes them over, so that a run
-//! that was stopped fits none of them again.
+//! Fits of objects: kept, and saved with the run, until the field takes them over, so that a run that was stopped fits
+//! none of them again.
 
 use std::collections::BTreeMap;
 
@@ -8,24 +8,52 @@ use cif_field::checkpoint::StateTensor;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::objects::{Found, Jointed};
+use super::Found;
+use super::parts::Jointed;
+use super::start::Fitted;
 
 /// Findings about objects, by label (dense index + 1). Gaussians are saved as tensors, everything else as JSON.
 #[derive(Clone, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct KnownObjects {
+pub(crate) struct KnownObjects {
     /// How they move as a whole.
-    pub(super) rigid: BTreeMap<u16, Found>,
+    pub(crate) rigid: BTreeMap<u16, Found>,
     /// Their parts on joints; `None` where they have none.
-    pub(super) parts: BTreeMap<u16, Option<Jointed>>,
+    pub(crate) parts: BTreeMap<u16, Option<Jointed>>,
+    /// True once all objects were tried for motion; a state of version 1 does not tell.
+    #[serde(default)]
+    pub(crate) is_searched: bool,
 }
 
 /// Start of the names of tensors.
 const TENSORS: &str = "objects.";
 
 impl KnownObjects {
-    pub(super) fn is_empty(&self) -> bool {
-        self.rigid.is_empty() && self.parts.is_empty()
+    pub(crate) fn is_empty(&self) -> bool {
+        self.rigid.is_empty() && self.parts.is_empty() && !self.is_searched
+    }
+
+    /// The motion of an object as a whole, where one was found.
+    pub(crate) fn moving(&self, label: u16) -> Option<&Fitted> {
+        match self.rigid.get(&label) {
+            Some(Found::Moves(fitted)) => Some(fitted),
+            _ => None,
+        }
+    }
+
+    /// The part of an object on a joint, where one was found.
+    pub(crate) fn jointed(&self, label: u16) -> Option<&Jointed> {
+        self.parts.get(&label)?.as_ref()
+    }
+
+    /// True where an object has poses, as a whole or of a part.
+    pub(crate) fn has_poses(&self, label: u16) -> bool {
+        self.moving(label).is_some() || self.jointed(label).is_some()
+    }
+
+    /// Number of objects that move as a whole.
+    pub(crate) fn moving_count(&self) -> usize {
+        self.rigid.values().filter(|found| matches!(found, Found::Moves(_))).count()
     }
 
     /// Sets of Gaussians, each under its name.
@@ -46,7 +74,7 @@ impl KnownObjects {
     }
 
     /// JSON and tensors to save; nothing where nothing is known.
-    pub(super) fn saved(&self) -> (Option<Value>, Vec<(String, StateTensor)>) {
+    pub(crate) fn saved(&self) -> (Option<Value>, Vec<(String, StateTensor)>) {
         if self.is_empty() {
             return (None, Vec::new());
         }
@@ -60,7 +88,7 @@ impl KnownObjects {
     }
 
     /// What [`Self::saved`] gave; `None` when it is damaged, or not of a capture with so many instances and times.
-    pub(super) fn restored(
+    pub(crate) fn restored(
         json: Value,
         tensors: &mut BTreeMap<String, StateTensor>,
         (instances, times): (usize, usize),
