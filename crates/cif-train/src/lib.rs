@@ -16,6 +16,7 @@
 //! | [`clock`] | where it reads time |
 //! | [`adam`] | the optimiser, and the regularisers of the planes |
 //! | [`density`] | which Gaussians come and go: densification strategies, relocation to instances with volume conservation |
+//! | [`effects`] | what has to show while it trains that it is worth its cost, one file each |
 //! | [`estimate`] | whose each Gaussian is, from masks |
 //! | `engine` | what computes the steps of a run: the processor, or a GPU |
 //! | `objects` | how rigid objects get poses, before the scene is trained |
@@ -51,6 +52,7 @@ pub mod clock;
 pub mod config;
 pub mod curve;
 pub mod density;
+pub mod effects;
 mod engine;
 pub mod error;
 pub mod estimate;

@@ -32,6 +32,9 @@ pub(crate) struct Progress {
     /// Wall time per stage, with everything inside it, seconds.
     #[serde(default)]
     pub stages_s: BTreeMap<String, f64>,
+    /// Time that judgements of effects took, by name, seconds.
+    #[serde(default)]
+    pub effects_s: BTreeMap<String, f64>,
     /// Quality over the run, as measured so far.
     #[serde(default)]
     pub curve: Curve,
@@ -93,14 +96,27 @@ pub(crate) struct Goals {
 pub(crate) enum AfterStep {
     /// Densification; refreshed identities and resampling in the instance stage.
     Changes,
-    /// Judgement of the optional outputs of the deformation.
+    /// Judgement of the optional outputs of the deformation, the first of the effects.
     Heads,
-    /// The test for Gaussians that stand still.
+    /// The test for Gaussians that stand still, the second.
     Still,
+    /// Judgement of an effect that was added to the run, counted from 0.
+    Added(usize),
     /// A point of the curve.
     Curve,
     /// Evaluation on held-out frames.
     Evaluation,
+}
+
+impl AfterStep {
+    /// Judgement of effect `k` of those behind a step.
+    pub(crate) fn effect(k: usize) -> Self {
+        match k {
+            0 => Self::Heads,
+            1 => Self::Still,
+            added => Self::Added(added - 2),
+        }
+    }
 }
 
 /// A scene that a run began with, as recorded.
@@ -165,6 +181,7 @@ impl Progress {
             wall_s: BTreeMap::new(),
             cpu_s: BTreeMap::new(),
             stages_s: BTreeMap::new(),
+            effects_s: BTreeMap::new(),
             curve: Curve::default(),
             goals: Goals::default(),
             sh_start: 0,

@@ -9,7 +9,7 @@ use cif_field::Field;
 use cif_geometry::PixelGrid;
 use cif_render::{Blending, Gradients, InstanceSettings, RenderSettings, RenderedImage, UNLABELLED};
 
-use crate::config::TrainConfig;
+use crate::config::{ObjectMotion, TrainConfig};
 use crate::density::DensifyStatistics;
 use crate::error::TrainError;
 use crate::frames::{FrameStore, TrainFrame};
@@ -100,6 +100,12 @@ impl State {
             deform: self.field.deformation.is_some(),
             ..RenderSettings::default()
         }
+    }
+
+    /// Motion that an object (a label: dense index + 1) is told to have.
+    pub(crate) fn told(&self, label: u16) -> Option<ObjectMotion> {
+        let name = &self.field.instances[usize::from(label) - 1].label;
+        self.config.motion.of.get(name).copied()
     }
 
     /// The picture that the camera of a frame records of a rendered one.

@@ -4,11 +4,13 @@
 //! |---|---|
 //! | `processor` | steps on the processor: the definition of each call |
 //! | `gpu` | steps recorded ahead on a GPU, behind the feature `wgpu` |
+//! | `failure` | what becomes of a run whose engine fails |
 //! | `validation` | any engine's step with every array looked at |
 //!
 //! An engine works on the [`State`] of the run. It may run ahead of it: what steps change is in the state after
 //! [`Engine::fetch`], and what the run then changes there is announced by [`Engine::changed`].
 
+pub(crate) mod failure;
 #[cfg(feature = "wgpu")]
 pub(crate) mod gpu;
 pub(crate) mod processor;

@@ -12,6 +12,7 @@ use rand::RngExt;
 use super::Trainer;
 use super::objects::in_time;
 use super::plan_step::plane_weights;
+use crate::effects::appearing::hide_absent;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
 use crate::guidance::Guide;
@@ -120,7 +121,8 @@ impl Trainer {
                     self.inject(of as u16 + 1, track, observations)?;
                 }
             }
-            self.hide_absent(&posed)?;
+            let notes = hide_absent(&mut self.state, self.simd, &posed)?;
+            self.messages.extend(notes);
         }
         let n = self.state.field.len();
         self.state.guidance.guide_of.resize(n, 0);

@@ -7,9 +7,6 @@
 //! | `run` | how it goes through its stages, and where it may be stopped |
 //! | `plan_step` | what decides a step |
 //! | `step` | how a step is done, and what falls behind it |
-//! | `still`, `resting` | which Gaussians skip the deformation network, one by one and as whole instances |
-//! | `changes` | where cameras that stay in place see the capture change |
-//! | `judged` | degrees of harmonics and outputs of the network that must show that they help |
 //! | `heads` | what heads of other systems see and change between steps |
 //! | `guidance` | how travelling objects start on the paths that masks tell |
 //! | `objects`, `parts` | which objects move as a whole or in a part, and how they join the field |
@@ -29,7 +26,6 @@
 //! threads.
 
 mod backend;
-mod changes;
 mod eta;
 mod evaluate;
 mod from_scene;
@@ -49,17 +45,13 @@ mod head_tests;
 mod heads;
 mod identity;
 mod initialize;
-mod judged;
 mod measure;
-mod motions;
 mod near;
 mod objects;
 mod pacing;
 mod parts;
 mod plan_step;
-mod presence;
 mod provenance;
-mod resting;
 mod resume;
 mod run;
 mod saving;
@@ -67,7 +59,6 @@ mod saving;
 mod shape;
 mod shares;
 mod step;
-mod still;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -80,7 +71,6 @@ use cif_render::{Gradients, UNLABELLED};
 
 #[cfg(feature = "wgpu")]
 pub use self::backend::Probe;
-use self::changes::Changes;
 use self::evaluate::MeasuredFrames;
 pub(crate) use self::initialize::automatic_time_nodes;
 pub use self::measure::InstancePass;
@@ -93,6 +83,8 @@ use crate::config::{HeadName, TrainConfig};
 use crate::curve::Curve;
 use crate::density::adaptive::Adaptive;
 use crate::density::{DensifyStatistics, Strategy};
+use crate::effects::changes::Changes;
+use crate::effects::{self, Effect};
 use crate::engine::Engine;
 use crate::engine::processor::Processor;
 use crate::error::TrainError;
@@ -160,6 +152,8 @@ pub struct Trainer {
     state: State,
     /// Adds and removes Gaussians.
     density: Arc<dyn Strategy>,
+    /// Effects that are judged while it trains, in order.
+    effects: Vec<Arc<dyn Effect>>,
     /// Computes the steps.
     engine: Box<dyn Engine>,
     /// Vector instructions of the processor.
@@ -266,6 +260,7 @@ impl Trainer {
         Ok(Self {
             stages: Stages { is_dynamic: config.effects.motion && dataset.times.len() > 1, has_instances },
             density: Arc::new(Adaptive),
+            effects: effects::all(),
             engine: Box::new(Processor::new(simd)),
             simd,
             order: None,
@@ -444,6 +439,12 @@ impl Trainer {
     /// is to be given them again.
     pub fn set_density(&mut self, strategy: Arc<dyn Strategy>) {
         self.density = strategy;
+    }
+
+    /// Judges a further effect, behind those of every run. It is not saved with the run: one that is resumed is to be given
+    /// it again.
+    pub fn add_effect(&mut self, effect: Arc<dyn Effect>) {
+        self.effects.push(effect);
     }
 
     /// Reads time from another clock; times of the run and its curve follow it.

@@ -12,6 +12,7 @@ use rayon::prelude::*;
 
 use super::Trainer;
 use crate::config::ObjectMotion;
+use crate::effects::appearing::Posed;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
 use crate::objects::{self, BENDS_NO_BETTER, Fitted, Found, Order, Plane, Surroundings};
@@ -125,12 +126,6 @@ impl Trainer {
         }
     }
 
-    /// Motion that an object (a label: dense index + 1) is told to have.
-    pub(super) fn told(&self, label: u16) -> Option<ObjectMotion> {
-        let name = &self.state.field.instances[usize::from(label) - 1].label;
-        self.state.config.motion.of.get(name).copied()
-    }
-
     /// Refuses motion that is told of objects that there are not.
     pub(super) fn check_told(&self) -> Result<(), TrainError> {
         let labels: Vec<String> = self.state.field.instances.iter().map(|i| i.label.clone()).collect();
@@ -240,7 +235,7 @@ impl Trainer {
         let surroundings = self.surroundings(plane, &order);
         let most = MOST_ERROR[usize::from(state.dataset.points.source == PointSource::Random)];
         let wanted: Vec<(u16, Option<ObjectMotion>)> =
-            labels.iter().map(|label| (*label, self.told(*label))).collect();
+            labels.iter().map(|label| (*label, self.state.told(*label))).collect();
         let fit = |(label, told): &(u16, Option<ObjectMotion>)| {
             let is_told = *told == Some(ObjectMotion::Rigid);
             let found = if *told == Some(ObjectMotion::Free) {
@@ -269,7 +264,7 @@ impl Trainer {
 
     /// Gives an object (a label: dense index + 1) that was fitted a group with Gaussians; false where it was not. What
     /// moves as a whole joins `posed`, with its group.
-    pub(super) fn add_object(&mut self, label: u16, posed: &mut Vec<(u16, u32)>) -> bool {
+    pub(super) fn add_object(&mut self, label: u16, posed: &mut Vec<Posed>) -> bool {
         let name = self.state.field.instances[usize::from(label) - 1].label.clone();
         if let Some(fitted) = self.state.objects.moving(label).cloned() {
             let how = match fitted.rotation {
@@ -280,7 +275,8 @@ impl Trainer {
                 "{name} moves as a whole: {}{how} (error {:.3} on pixels left out)",
                 fitted.way, fitted.error
             )));
-            posed.push((label, self.join(name, &fitted)));
+            let group = self.join(name, &fitted);
+            posed.push(Posed { label, group });
             return true;
         }
         if let Some(found) = self.state.objects.jointed(label).cloned() {
@@ -294,7 +290,7 @@ impl Trainer {
     /// The warning that belongs to a travelling object without poses; none where a budget left no time for them, which
     /// was noted.
     fn warning_without_poses(&self, label: u16, name: &str) -> Option<TrainEvent> {
-        let is_set = self.told(label) == Some(ObjectMotion::Rigid);
+        let is_set = self.state.told(label) == Some(ObjectMotion::Rigid);
         let message = match self.state.objects.rigid.get(&label) {
             Some(Found::Nowhere) => format!(
                 "{name}: depth uncertain: one camera sees it, and nothing that it stands on is known, so its size and \

@@ -20,7 +20,7 @@ impl Trainer {
             return Ok(());
         }
         let known = &self.state.objects;
-        let is_open = |label: &u16| known.moving(*label).is_none() && self.told(*label).is_none();
+        let is_open = |label: &u16| known.moving(*label).is_none() && self.state.told(*label).is_none();
         let wanted: Vec<u16> = labels.iter().copied().filter(is_open).collect();
         let is_known = |label: &&u16| known.parts.contains_key(*label);
         let unknown: Vec<u16> = wanted.iter().filter(|label| !is_known(label)).copied().collect();

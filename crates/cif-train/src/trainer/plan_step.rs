@@ -12,6 +12,7 @@ use rand_pcg::Pcg64;
 use super::{InstancePass, Trainer};
 use crate::adam::PlaneWeights;
 use crate::config::{Ablation, TrainConfig};
+use crate::effects::is_judged;
 use crate::error::TrainError;
 use crate::exposure::RATES;
 use crate::frames::MOST_AHEAD;
@@ -64,13 +65,14 @@ impl Trainer {
         let batch = self.state.config.stages.batch;
         let at = self.moment(stage, iteration, self.state.progress.total_steps + 1);
         let [holds_out, renormalises] = [Due::HoldOut, Due::Renormalise].map(|due| at.has(due));
+        let holds_out = holds_out || self.effects.iter().any(|effect| effect.holds_out(&at));
         let counts_statistics = at.is_of_colors() && self.density.counts_statistics(&at);
         let mut views = Vec::with_capacity(batch as usize);
         for k in 0..batch {
             let view = self.view_at(stage, u64::from(iteration - 1) * u64::from(batch) + u64::from(k));
             let frame = self.state.frames.get(&self.state.dataset, view)?;
             let index = self.state.frames.index(view);
-            let leaves_judged = holds_out && self.is_judged_by(index);
+            let leaves_judged = holds_out && is_judged(&self.state.frames, index);
             views.push(StepView { index, frame, leaves_judged });
         }
         self.expect_views(stage, u64::from(iteration) * u64::from(batch));

@@ -52,6 +52,7 @@ impl Trainer {
                 notes: members(json!({
                     "iterations_by_stage": progress.steps,
                     "seconds_by_stage": progress.stages_s,
+                    "seconds_by_effect": (!progress.effects_s.is_empty()).then_some(&progress.effects_s),
                     "cpu_s_by_phase": progress.cpu_s,
                     "simd": self.simd_name(),
                     "gaussians": self.state.field.gaussians.len(),

@@ -12,15 +12,18 @@ use crate::config::Ablation;
 use crate::density::adaptive::reset_opacities;
 use crate::density::relocate::{ResampleContext, apply, choose};
 use crate::density::{Change, DensifyStatistics, Rearrangement, Rows};
-use crate::engine::processor::Processor;
+use crate::effects::harmonics::degree_at;
+use crate::effects::{Bench, Effect, Place, Standing, Step, copy_still, gather_still};
+use crate::engine::failure::{draw, replace_failed};
 use crate::engine::{Views, validation};
 use crate::error::TrainError;
 use crate::events::TrainEvent;
 use crate::guard::{Hint, MAX_ROLLBACKS_IN_A_ROW};
 use crate::progress::AfterStep;
 use crate::random::{Purpose, stream};
-use crate::schedule::Due;
+use crate::schedule::{Due, Moment};
 use crate::stage::Stage;
+use crate::state::State;
 use crate::step::{StepLoss, StepReport};
 use crate::times::lap;
 
@@ -36,12 +39,13 @@ impl Trainer {
     fn try_step(&mut self, events: &mut Vec<TrainEvent>) -> Result<StepLoss, TrainError> {
         let start = Instant::now();
         let (stage, iteration) = (self.state.progress.stage, self.state.progress.iteration + 1);
-        if self.judges_harmonics() {
+        for effect in self.due_effects(Place::Before, &self.coming()) {
             self.fetch()?;
-            self.judge_sh(stage, iteration, events)?;
+            self.judge(&*effect, stage, iteration, events)?;
         }
         if matches!(stage, Stage::Coarse | Stage::Fine) {
-            self.state.field.sh_degree = self.degree_at(iteration);
+            let State { field, config, progress, .. } = &mut self.state;
+            field.sh_degree = degree_at(config, progress, iteration);
         }
         if self.debug_validation {
             self.fetch()?;
@@ -89,22 +93,59 @@ impl Trainer {
 
     /// After a failure of its engine the run goes on on the processor, from what was fetched last.
     fn engine_failed(&mut self, error: TrainError) -> TrainError {
-        if matches!(error, TrainError::Device(_)) {
-            self.engine.withdraw(&mut self.state);
-            self.engine = Box::new(Processor::new(self.simd));
-        }
-        error
+        replace_failed(&mut self.engine, &mut self.state, self.simd, error)
     }
 
-    /// Renders views between steps, see [`Engine::draw`](crate::engine::Engine::draw).
+    /// Renders views between steps, see [`draw`].
     pub(super) fn draw(
         &mut self,
         trial: Option<&Field>,
         views: Views<'_>,
         each: &mut dyn FnMut(RenderedImage),
     ) -> Result<(), TrainError> {
-        let drawn = self.engine.draw(&self.state, trial, views, each);
-        drawn.map_err(|error| self.engine_failed(error))
+        draw(&mut self.engine, &mut self.state, self.simd, trial, views, each)
+    }
+
+    /// Effects that are judged at a place around a step.
+    fn due_effects(&self, place: Place, step: &Moment<'_>) -> Vec<Arc<dyn Effect>> {
+        let standing = Standing { field: &self.state.field, progress: &self.state.progress };
+        let is_due = |effect: &&Arc<dyn Effect>| effect.place() == place && effect.due(step, &standing);
+        self.effects.iter().filter(is_due).cloned().collect()
+    }
+
+    /// The run at the judgement of effects that falls on a step of a stage.
+    pub(super) fn at_judgement<'a>(
+        &'a mut self,
+        stage: Stage,
+        iteration: u32,
+        events: &'a mut Vec<TrainEvent>,
+    ) -> Bench<'a> {
+        let is_before = iteration > self.state.progress.iteration;
+        let total = self.state.progress.total_steps + u64::from(is_before);
+        let facts = self.moment(stage, iteration, total).facts;
+        Bench {
+            step: Step { stage, iteration, total, facts },
+            state: &mut self.state,
+            engine: &mut self.engine,
+            simd: self.simd,
+            changes: &mut self.changes,
+            events,
+        }
+    }
+
+    /// Judges an effect, and counts the time that it takes.
+    fn judge(
+        &mut self,
+        effect: &dyn Effect,
+        stage: Stage,
+        iteration: u32,
+        events: &mut Vec<TrainEvent>,
+    ) -> Result<(), TrainError> {
+        let start = Instant::now();
+        let judged = effect.judge(&mut self.at_judgement(stage, iteration, events));
+        *self.state.progress.effects_s.entry(effect.name().to_owned()).or_default() +=
+            start.elapsed().as_secs_f64();
+        judged
     }
 
     /// Takes in a step: its losses, or its fault. Too many bad steps in a row end the run, which then stands before
@@ -145,9 +186,8 @@ impl Trainer {
         let iteration = self.state.progress.iteration;
         let due = self.done().all();
         let falls = |what: Due| due.contains(&what);
-        let judges = [Due::JudgeOutputs, Due::TestStill]
-            .map(|judged| self.state.field.deformation.is_some() && falls(judged));
-        if judges.contains(&true) || falls(Due::EstimateIdentities) || self.engine.is_far_ahead() {
+        let judged = self.due_effects(Place::Behind, &self.done());
+        if !judged.is_empty() || falls(Due::EstimateIdentities) || self.engine.is_far_ahead() {
             self.fetch()?;
         }
         if self.state.progress.after_step == Some(AfterStep::Changes) {
@@ -157,20 +197,19 @@ impl Trainer {
             if densifies || falls(Due::EstimateIdentities) || falls(Due::Resample) {
                 self.change_gaussians(stage, iteration, &due, events)?;
             }
-            self.state.progress.after_step = Some(AfterStep::Heads);
+            self.state.progress.after_step = Some(AfterStep::effect(0));
         }
-        if self.state.progress.after_step == Some(AfterStep::Heads) {
-            if judges[0] {
-                self.wholly(events, |trainer, events| trainer.judge_heads(stage, iteration, events))?;
+        let behind = self.effects.iter().filter(|effect| effect.place() == Place::Behind);
+        for (k, effect) in behind.cloned().collect::<Vec<_>>().into_iter().enumerate() {
+            if self.state.progress.after_step != Some(AfterStep::effect(k)) {
+                continue;
             }
-            self.state.progress.after_step = Some(AfterStep::Still);
-        }
-        if self.state.progress.after_step == Some(AfterStep::Still) {
-            if judges[1] {
-                self.wholly(events, |trainer, events| trainer.settle(stage, iteration, events))?;
+            if judged.iter().any(|due| Arc::ptr_eq(due, &effect)) {
+                self.judge_wholly(&*effect, stage, iteration, events)?;
             }
-            self.state.progress.after_step = None;
+            self.state.progress.after_step = Some(AfterStep::effect(k + 1));
         }
+        self.state.progress.after_step = None;
         Ok(())
     }
 
@@ -192,16 +231,18 @@ impl Trainer {
         changed.and(taken)
     }
 
-    /// Does work that judges the field, or leaves everything as it was when that fails or is stopped.
-    fn wholly(
+    /// Judges an effect behind a step, or leaves everything as it was when that fails or is stopped.
+    fn judge_wholly(
         &mut self,
+        effect: &dyn Effect,
+        stage: Stage,
+        iteration: u32,
         events: &mut Vec<TrainEvent>,
-        work: impl FnOnce(&mut Self, &mut Vec<TrainEvent>) -> Result<(), TrainError>,
     ) -> Result<(), TrainError> {
         let told = events.len();
         let before =
             (self.state.field.clone(), self.state.optimiser.of(&MLP).clone(), self.state.progress.still_rung);
-        let result = work(self, events);
+        let result = self.judge(effect, stage, iteration, events);
         if result.is_err() {
             (self.state.field, *self.state.optimiser.of(&MLP), self.state.progress.still_rung) = before;
             self.state.gradients = Gradients::zeros(&self.state.field);
@@ -261,7 +302,7 @@ impl Trainer {
         self.state.statistics.gather(&change.origins);
         self.state.head_tensors.gather(&change.parents, &change.origins);
         self.state.guidance.gather(&change.parents);
-        self.gather_still(&change.parents);
+        gather_still(&mut self.state.field, &change.parents);
         if let Some(tracks) = &mut self.state.field.tracks {
             *tracks = tracks.gather(&change.parents);
         }
@@ -301,7 +342,7 @@ impl Trainer {
         for pair in &relocations.pairs {
             self.state.guidance.copy(pair.weak, pair.source);
             self.state.head_tensors.relocate(pair.weak, pair.source);
-            self.copy_still(pair.weak, pair.source);
+            copy_still(&mut self.state.field, pair.weak, pair.source);
             if let Some(tracks) = &mut self.state.field.tracks {
                 tracks.group_of[pair.weak as usize] = tracks.group_of[pair.source as usize];
             }

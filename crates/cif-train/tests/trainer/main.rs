@@ -6,7 +6,7 @@
 //! | `training`, `effects`, `guidance` | whole runs: quality, resuming, threads, what is skipped, what masks tell |
 //! | `acceptance` | identities and their resampling keep what they promise |
 //! | `from_scene` | instances on the reconstruction of another run |
-//! | `density` | densification rules declared by a test |
+//! | `density`, `added_effects` | densification rules, and an effect, declared by a test |
 //! | `heads` | a head declared by a test, on every engine |
 //! | `memory` | frames that do not fit into memory, read ahead |
 //! | `curve`, `pacing`, `measure` | error curves, budgets of time, measured steps |
@@ -15,6 +15,7 @@
 #![allow(clippy::unwrap_used)] // Helpers of tests.
 
 mod acceptance;
+mod added_effects;
 mod compared_heads;
 mod curve;
 mod density;

@@ -26,7 +26,7 @@ const FEWEST_MOVING: u32 = 3;
 
 /// Mean and spread of the deltas that the network gives a Gaussian over the probe times.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Motion {
+pub(crate) struct Motion {
     /// Mean of the deltas.
     pub mean: Deltas<f32>,
     /// Largest distance of the displacement from its mean, metres.
@@ -36,7 +36,7 @@ pub(super) struct Motion {
 }
 
 /// Evenly spread captured times.
-pub(super) fn probe_times(times: &[f64]) -> Vec<f64> {
+pub(crate) fn probe_times(times: &[f64]) -> Vec<f64> {
     let mut probes: Vec<f64> =
         (0..PROBES).map(|k| times[k * times.len().saturating_sub(1) / (PROBES - 1)]).collect();
     probes.dedup();
@@ -45,18 +45,18 @@ pub(super) fn probe_times(times: &[f64]) -> Vec<f64> {
 
 /// Limits of motion.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Limits {
+pub(crate) struct Limits {
     /// Metres.
     pub displacement: f32,
     pub shape: f32,
 }
 
 impl Limits {
-    pub(super) fn scaled(self, factor: f32) -> Self {
+    pub(crate) fn scaled(self, factor: f32) -> Self {
         Self { displacement: factor * self.displacement, shape: factor * self.shape }
     }
 
-    pub(super) fn hold(self, motion: &Motion) -> bool {
+    pub(crate) fn hold(self, motion: &Motion) -> bool {
         motion.displacement <= self.displacement && motion.shape <= self.shape
     }
 }
@@ -71,7 +71,7 @@ const PASSING: usize = 64;
 /// Gaussians among others that move: of those that go through the network around them, a share moves more than the
 /// limits, or an object with poses of its own passes. Things move as wholes, what moves little learns it late, and
 /// objects cast shadows.
-pub(super) fn restless(field: &Field, motions: &[Motion], limits: Limits) -> Vec<bool> {
+pub(crate) fn restless(field: &Field, motions: &[Motion], limits: Limits) -> Vec<bool> {
     let Some(deformation) = &field.deformation else { return vec![false; motions.len()] };
     let cell_at = |place: [f64; 3]| -> [i64; 3] {
         place.map(|place| {
@@ -132,12 +132,12 @@ fn passed(field: &Field, limits: Limits) -> impl Iterator<Item = DVec3> {
 
 /// Takes rows out of the network, at the mean of what it did to them; returns their number. A field without a
 /// deformation stays as it is.
-pub(super) fn put_to_rest(field: &mut Field, motions: &[Motion], wanted: impl Fn(usize) -> bool) -> usize {
+pub(crate) fn put_to_rest(field: &mut Field, motions: &[Motion], wanted: impl Fn(usize) -> bool) -> usize {
     set_still(field, motions, true, wanted)
 }
 
 /// Hands rows back to the network, near where they were; returns their number.
-pub(super) fn wake(field: &mut Field, motions: &[Motion], wanted: impl Fn(usize) -> bool) -> usize {
+pub(crate) fn wake(field: &mut Field, motions: &[Motion], wanted: impl Fn(usize) -> bool) -> usize {
     set_still(field, motions, false, wanted)
 }
 
@@ -160,7 +160,7 @@ fn set_still(field: &mut Field, motions: &[Motion], to: bool, wanted: impl Fn(us
 }
 
 /// Motions that the network gives rows over some times, also rows that are marked as still.
-pub(super) fn probe(
+pub(crate) fn probe(
     deformation: &Deformation,
     gaussians: &Gaussians,
     rows: &[u32],
@@ -201,7 +201,7 @@ fn motion(deltas: &[&Deltas<f32>], quaternion_norm: f32) -> Motion {
 }
 
 /// Adds values, weighted, to totals.
-pub(super) fn accumulate(totals: &mut [f32], values: &[f32], weight: f32) {
+pub(crate) fn accumulate(totals: &mut [f32], values: &[f32], weight: f32) {
     for (total, value) in totals.iter_mut().zip(values) {
         *total += weight * value;
     }

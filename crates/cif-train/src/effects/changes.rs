@@ -24,7 +24,7 @@ const FEWEST_PIXELS: u32 = 3;
 
 /// Change that the cameras see at a point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Sight {
+pub(crate) enum Sight {
     /// No camera has it in its image.
     Unseen,
     /// Most cameras that have it in their images see nothing change there.
@@ -40,7 +40,7 @@ struct View {
 }
 
 /// All cameras of a capture, where every one stays in place.
-pub(super) struct Changes {
+pub(crate) struct Changes {
     views: Vec<View>,
 }
 
@@ -60,12 +60,12 @@ fn fixed_cameras(dataset: &Dataset, frames: &FrameStore) -> Vec<Vec<usize>> {
 impl Changes {
     /// True when a capture shows what changes: every camera with several training frames stays in place, at several
     /// times.
-    pub(super) fn are_shown(dataset: &Dataset, frames: &FrameStore) -> bool {
+    pub(crate) fn are_shown(dataset: &Dataset, frames: &FrameStore) -> bool {
         dataset.times.len() > 1 && !fixed_cameras(dataset, frames).is_empty()
     }
 
     /// Compares the training images of every camera.
-    pub(super) fn find(dataset: &Dataset, frames: &FrameStore) -> Result<Self, TrainError> {
+    pub(crate) fn find(dataset: &Dataset, frames: &FrameStore) -> Result<Self, TrainError> {
         let mut views = Vec::new();
         for of in fixed_cameras(dataset, frames) {
             let count = of.len().min(IMAGES);
@@ -90,7 +90,7 @@ impl Changes {
     }
 
     /// Classifies a point of the world by the change that the cameras see there.
-    pub(super) fn at(&self, point: [f32; 3]) -> Sight {
+    pub(crate) fn at(&self, point: [f32; 3]) -> Sight {
         let point = DVec3::from(point.map(f64::from));
         let (mut seen, mut changing) = (0, 0);
         for View { camera, changes } in &self.views {

@@ -2,13 +2,15 @@
 //! They are taken out of it as a whole where the held-out pixels hardly miss it, so that they leave as one thing that
 //! stands still; likewise what stays behind of an object that has poses.
 
+use cif_field::Field;
 use glam::DVec3;
 
-use super::Trainer;
-use super::judged::{JudgedErrors, gain};
+use super::Bench;
+use super::bench::{JudgedErrors, gain};
 use super::motions::{Motion, put_to_rest};
 use crate::config::ObjectMotion;
 use crate::error::TrainError;
+use crate::state::State;
 
 /// Loss on held-out pixels, dB, up to which instances are taken to rest: each on its own pixels, and together on all.
 const OWN_LOSS: f64 = 1.0;
@@ -23,83 +25,80 @@ const TREMBLING_LOSSES: [f64; 2] = [8.0, 0.3];
 /// Share of its image on labelled pixels from which a Gaussian may leave with its instance.
 const LABELLED_SHARE: f32 = 0.2;
 
-impl Trainer {
-    /// Puts to rest what the network moves of every instance whose pixels allow it; returns the number of Gaussians. It
-    /// does nothing before identities are estimated.
-    pub(super) fn rest_instances(&mut self, motions: &[Motion]) -> Result<usize, TrainError> {
-        let instance_of = self.rows_of_instances();
-        let mut resting = self.may_rest(&instance_of);
-        if !resting.contains(&true) {
-            return Ok(0);
-        }
-        let trembling = self.trembling(motions, &instance_of);
-        let settings = self.state.color_settings();
-        let before = self.judged_errors(None, &settings)?;
-        while resting.contains(&true) {
-            let mut trial = self.state.field.clone();
-            let rests = |row: usize| {
-                instance_of[row].is_some_and(|instance| resting[instance]) && !self.is_mover(row)
-            };
-            let count = put_to_rest(&mut trial, motions, rests);
-            let after = self.judged_errors(Some(&trial), &settings)?;
-            let missed = missed(&before, &after, &resting, &trembling);
-            if missed.is_empty() {
-                self.state.field = trial;
-                return Ok(count);
-            }
-            missed.into_iter().for_each(|instance| resting[instance] = false);
-        }
-        Ok(0)
+/// Puts to rest what the network moves of every instance whose pixels allow it; returns the number of Gaussians. It does
+/// nothing before identities are estimated.
+pub(crate) fn rest_instances(bench: &mut Bench<'_>, motions: &[Motion]) -> Result<usize, TrainError> {
+    let instance_of = rows_of_instances(&bench.state.field);
+    let mut resting = may_rest(bench.state, &instance_of);
+    if !resting.contains(&true) {
+        return Ok(0);
     }
-
-    /// True for instances that the network shifts little beside their size.
-    fn trembling(&self, motions: &[Motion], instance_of: &[Option<usize>]) -> Vec<bool> {
-        let field = &self.state.field;
-        let is_still = |row: usize| field.deformation.as_ref().is_none_or(|network| network.is_still(row));
-        let mut shifts = vec![Shift::default(); field.instances.len()];
-        for (row, instance) in instance_of.iter().enumerate() {
-            if let Some(instance) = instance.filter(|_| !self.is_mover(row)) {
-                let displacement = if is_still(row) { 0.0 } else { f64::from(motions[row].displacement) };
-                let place = DVec3::from_array(field.gaussians.means[row].map(f64::from));
-                shifts[instance].add(f64::from(field.gaussians.opacity(row)), place, displacement);
-            }
-        }
-        shifts.iter().map(Shift::trembles).collect()
-    }
-
-    /// The instance of every row that may leave with it.
-    fn rows_of_instances(&self) -> Vec<Option<usize>> {
-        let field = &self.state.field;
-        let Some((identities, of)) = field.identities.as_ref().zip(field.instance_of_gaussians()) else {
-            return vec![None; field.len()];
+    let trembling = trembling(bench.state, motions, &instance_of);
+    let settings = bench.state.color_settings();
+    let before = bench.errors(None, &settings)?;
+    while resting.contains(&true) {
+        let mut trial = bench.state.field.clone();
+        let rests = |row: usize| {
+            instance_of[row].is_some_and(|instance| resting[instance]) && !is_mover(bench.state, row)
         };
-        let shares = identities.labelled_shares();
-        of.into_iter()
-            .zip(shares)
-            .map(|(of, share)| of.filter(|_| share >= LABELLED_SHARE).map(usize::from))
-            .collect()
-    }
-
-    /// True for Gaussians that were made for a travelling object, or that have poses.
-    fn is_mover(&self, row: usize) -> bool {
-        let is_posed = self.state.field.tracks.as_ref().is_some_and(|tracks| tracks.group(row).is_some());
-        is_posed || self.state.guidance.travels(row)
-    }
-
-    /// Instances of which something goes through the network that is no mover, and that are not told to be free.
-    fn may_rest(&self, instance_of: &[Option<usize>]) -> Vec<bool> {
-        let field = &self.state.field;
-        let mut may_rest = vec![false; field.instances.len()];
-        let Some(deformation) = &field.deformation else { return may_rest };
-        for (row, instance) in instance_of.iter().enumerate() {
-            if let Some(instance) = *instance
-                && self.told(instance as u16 + 1) != Some(ObjectMotion::Free)
-            {
-                may_rest[instance] |= !deformation.is_still(row) && !self.is_mover(row);
-            }
+        let count = put_to_rest(&mut trial, motions, rests);
+        let after = bench.errors(Some(&trial), &settings)?;
+        let missed = missed(&before, &after, &resting, &trembling);
+        if missed.is_empty() {
+            bench.state.field = trial;
+            return Ok(count);
         }
-        may_rest
+        missed.into_iter().for_each(|instance| resting[instance] = false);
     }
+    Ok(0)
+}
+
+/// True for instances that the network shifts little beside their size.
+fn trembling(state: &State, motions: &[Motion], instance_of: &[Option<usize>]) -> Vec<bool> {
+    let field = &state.field;
+    let is_still = |row: usize| field.deformation.as_ref().is_none_or(|network| network.is_still(row));
+    let mut shifts = vec![Shift::default(); field.instances.len()];
+    for (row, instance) in instance_of.iter().enumerate() {
+        if let Some(instance) = instance.filter(|_| !is_mover(state, row)) {
+            let displacement = if is_still(row) { 0.0 } else { f64::from(motions[row].displacement) };
+            let place = DVec3::from_array(field.gaussians.means[row].map(f64::from));
+            shifts[instance].add(f64::from(field.gaussians.opacity(row)), place, displacement);
+        }
+    }
+    shifts.iter().map(Shift::trembles).collect()
+}
+
+/// The instance of every row that may leave with it.
+fn rows_of_instances(field: &Field) -> Vec<Option<usize>> {
+    let Some((identities, of)) = field.identities.as_ref().zip(field.instance_of_gaussians()) else {
+        return vec![None; field.len()];
+    };
+    let shares = identities.labelled_shares();
+    of.into_iter()
+        .zip(shares)
+        .map(|(of, share)| of.filter(|_| share >= LABELLED_SHARE).map(usize::from))
+        .collect()
+}
+
+/// True for Gaussians that were made for a travelling object, or that have poses.
+fn is_mover(state: &State, row: usize) -> bool {
+    let is_posed = state.field.tracks.as_ref().is_some_and(|tracks| tracks.group(row).is_some());
+    is_posed || state.guidance.travels(row)
+}
+
+/// Instances of which something goes through the network that is no mover, and that are not told to be free.
+fn may_rest(state: &State, instance_of: &[Option<usize>]) -> Vec<bool> {
+    let field = &state.field;
+    let mut may_rest = vec![false; field.instances.len()];
+    let Some(deformation) = &field.deformation else { return may_rest };
+    for (row, instance) in instance_of.iter().enumerate() {
+        if let Some(instance) = *instance
+            && state.told(instance as u16 + 1) != Some(ObjectMotion::Free)
+        {
+            may_rest[instance] |= !deformation.is_still(row) && !is_mover(state, row);
+        }
+    }
+    may_rest
 }
 
 /// Sums over the Gaussians of an instance, by their opacities.
@@ -154,10 +153,11 @@ fn missed(before: &JudgedErrors, after: &JudgedErrors, resting: &[bool], trembli
 
 #[cfg(test)]
 mod tests {
-    use super::super::guard_tests::support::{Scene, capture, small_config, stopped_after};
-    use super::super::judged::SquaredError;
+    use super::super::bench::SquaredError;
     use super::super::motions::{probe, probe_times};
     use super::*;
+    use crate::stage::Stage;
+    use crate::trainer::guard_tests::support::{Scene, capture, small_config, stopped_after};
 
     #[test]
     fn instances_rest_where_their_pixels_allow_it() {
@@ -178,22 +178,24 @@ mod tests {
             &rows,
             &probe_times(&trainer.state.dataset.times),
         );
-        let instance_of = trainer.rows_of_instances();
-        assert!(trainer.may_rest(&instance_of)[0]);
-        let settings = trainer.state.color_settings();
-        let before = trainer.judged_error(None, &settings).unwrap();
-        assert!(trainer.rest_instances(&motions).unwrap() > 10);
+        let instance_of = rows_of_instances(&trainer.state.field);
+        assert!(may_rest(&trainer.state, &instance_of)[0]);
+        let mut events = Vec::new();
+        let mut bench = trainer.at_judgement(Stage::Instance, 1, &mut events);
+        let before = bench.error(None).unwrap();
+        assert!(rest_instances(&mut bench, &motions).unwrap() > 10);
+        let after = bench.error(None).unwrap();
         for (row, instance) in instance_of.iter().enumerate() {
             let is_still = trainer.state.field.deformation.as_ref().unwrap().is_still(row);
-            let rests = *instance == Some(0) && !trainer.is_mover(row);
+            let rests = *instance == Some(0) && !is_mover(&trainer.state, row);
             assert!(is_still || !rests, "{row} of a ball that rests");
-            assert!(!is_still || !trainer.is_mover(row), "{row} of the ball that moves");
+            assert!(!is_still || !is_mover(&trainer.state, row), "{row} of the ball that moves");
         }
-        assert!(!trainer.may_rest(&instance_of)[0]);
-        assert!(gain(trainer.judged_error(None, &settings).unwrap(), before) <= LOSS);
+        assert!(!may_rest(&trainer.state, &instance_of)[0]);
+        assert!(gain(after, before) <= LOSS);
         trainer.state.config.motion.of =
             ["ball 4", "ball 7", "ball 9"].map(|name| (name.to_owned(), ObjectMotion::Free)).into();
-        assert_eq!(trainer.may_rest(&instance_of), [false; 3]);
+        assert_eq!(may_rest(&trainer.state, &instance_of), [false; 3]);
     }
 
     #[test]
