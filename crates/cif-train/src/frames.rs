@@ -5,7 +5,7 @@ mod ahead;
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use ahead::Ahead;
 pub(crate) use ahead::MOST as MOST_AHEAD;
@@ -17,10 +17,11 @@ use rayon::prelude::*;
 
 use crate::error::TrainError;
 use crate::mask_edges::{self, Doubt};
+use crate::mask_table::MaskTable;
 use crate::phase::Phase;
 use crate::phases::Phases;
 use crate::switches::{Seen, put_right, switches};
-use crate::tracks::{misfits, observe};
+use crate::tracks::misfits;
 
 /// A decoded frame.
 pub(crate) struct TrainFrame {
@@ -41,6 +42,18 @@ pub(crate) struct FrameStore {
     decoding: Arc<Decoding>,
     /// Frames that are being decoded for coming steps, where some do not fit into memory.
     ahead: Option<Ahead>,
+    /// Masks of the training frames as they are now, once they were asked for.
+    masks: Mutex<Option<Arc<FrameMasks>>>,
+}
+
+/// Masks of all training frames, by training frame; `None` without a mask.
+pub(crate) type FrameMasks = Vec<Option<MaskTable>>;
+
+/// The masks of a training frame as they were read, before any is put right.
+pub(crate) struct ReadMasks {
+    table: Option<MaskTable>,
+    /// Colours and places, where they were asked for.
+    seen: Seen,
 }
 
 /// Steps from the files of a frame to the images that are trained on.
@@ -83,7 +96,7 @@ impl FrameStore {
         let frames = training.map(|(index, _)| (index, None)).collect();
         let switched = BTreeMap::new();
         let decoding = Arc::new(Decoding { label_of_id, background, maps, switched, moves_edges: false });
-        let mut store = Self { frames, decoding, ahead: None };
+        let mut store = Self { frames, decoding, ahead: None, masks: Mutex::default() };
         if store.frames.is_empty() {
             return Err(TrainError::NoTrainingFrames { root: dataset.root.clone() });
         }
@@ -160,45 +173,84 @@ impl FrameStore {
         })
     }
 
-    /// Leaves out the training frames whose masks contradict the others (see [`misfits`]); their indices in the
-    /// capture.
-    pub(crate) fn leave_out_misfits(
-        &mut self,
-        dataset: &Dataset,
-        limit: f64,
-        phases: &Phases,
-    ) -> Result<Vec<usize>, TrainError> {
-        let mut masked = Vec::new();
-        let mut seen = Vec::new();
-        for k in 0..self.len() {
-            phases.check()?;
-            if let Some(labels) = &self.get(dataset, k)?.labels {
-                let frame = &dataset.frames[self.index(k)];
-                masked.push(k);
-                seen.push(observe(labels, &frame.camera, frame.time_index));
-            }
-            phases.advance();
+    /// Masks of the training frames as they are now: read when they are asked for first, in one pass over all frames.
+    ///
+    /// # Errors
+    /// When a frame cannot be read, or the run is to stop.
+    pub(crate) fn masks(&self, dataset: &Dataset, phases: &Phases) -> Result<Arc<FrameMasks>, TrainError> {
+        let known = || self.masks.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(masks) = &*known() {
+            return Ok(Arc::clone(masks));
         }
-        let left_out: Vec<usize> = misfits(&seen, limit).into_iter().map(|k| self.index(masked[k])).collect();
-        self.frames.retain(|(index, _)| !left_out.contains(index));
-        Ok(left_out)
+        let read = |k: usize| {
+            phases.check()?;
+            Ok(self.get(dataset, k)?.labels.as_ref().map(MaskTable::of))
+        };
+        let masks: FrameMasks =
+            (0..self.len()).into_par_iter().map(read).collect::<Result<_, TrainError>>()?;
+        Ok(Arc::clone(known().insert(Arc::new(masks))))
     }
 
-    /// Puts right the masks that show other objects (see [`crate::switches`]); the new labels of masks by old ones, by
-    /// index in the capture.
-    pub(crate) fn put_switches_right(
-        &mut self,
+    /// Frames, or their masks, have changed.
+    fn forget_masks(&mut self) {
+        *self.masks.get_mut().unwrap_or_else(PoisonError::into_inner) = None;
+        self.ahead.iter().for_each(Ahead::give_up);
+    }
+
+    /// Reads the masks of the training frames, before any is put right; `with_colors` with their colours and places.
+    ///
+    /// # Errors
+    /// When a frame cannot be read, or the run is to stop.
+    pub(crate) fn read_masks(
+        &self,
         dataset: &Dataset,
+        with_colors: bool,
         phases: &Phases,
-    ) -> Result<&BTreeMap<usize, BTreeMap<u16, u16>>, TrainError> {
-        let of = |k: usize| {
+    ) -> Result<Vec<ReadMasks>, TrainError> {
+        let read = |k: usize| {
             phases.check()?;
             let of = &dataset.frames[self.index(k)];
             let frame = self.get(dataset, k)?;
             phases.advance();
-            Ok(Seen::of(&frame.image, frame.labels.as_ref(), &of.camera_name, of.time_index))
+            let labels = frame.labels.as_ref();
+            let colored = labels.filter(|_| with_colors);
+            let seen = Seen::of(&frame.image, colored, &of.camera_name, of.time_index);
+            Ok(ReadMasks { table: labels.map(MaskTable::of), seen })
         };
-        let seen: Vec<_> = (0..self.len()).into_par_iter().map(of).collect::<Result<_, TrainError>>()?;
+        (0..self.len()).into_par_iter().map(read).collect()
+    }
+
+    /// Leaves out the training frames whose masks contradict the others (see [`misfits`]), also of what was `read`; their
+    /// indices in the capture.
+    pub(crate) fn leave_out_misfits(
+        &mut self,
+        dataset: &Dataset,
+        read: &mut Vec<ReadMasks>,
+        limit: f64,
+    ) -> Vec<usize> {
+        let (mut masked, mut seen) = (Vec::new(), Vec::new());
+        for (k, masks) in read.iter().enumerate() {
+            if let Some(table) = &masks.table {
+                let frame = &dataset.frames[self.index(k)];
+                masked.push(k);
+                seen.push(table.observations(&frame.camera, frame.time_index));
+            }
+        }
+        let left_out: Vec<usize> = misfits(&seen, limit).into_iter().map(|k| self.index(masked[k])).collect();
+        let mut kept = self.frames.iter().map(|(index, _)| !left_out.contains(index));
+        read.retain(|_| kept.next() == Some(true));
+        self.frames.retain(|(index, _)| !left_out.contains(index));
+        self.forget_masks();
+        left_out
+    }
+
+    /// Puts right the masks that show other objects by what was `read` of them (see [`crate::switches`]); the new labels
+    /// of masks by old ones, by index in the capture.
+    pub(crate) fn put_switches_right(
+        &mut self,
+        read: Vec<ReadMasks>,
+    ) -> &BTreeMap<usize, BTreeMap<u16, u16>> {
+        let seen: Vec<Seen> = read.into_iter().map(|masks| masks.seen).collect();
         let found =
             switches(&seen).into_iter().zip(&mut self.frames).filter(|(renamed, _)| !renamed.is_empty());
         for (renamed, (index, frame)) in found {
@@ -208,8 +260,8 @@ impl FrameStore {
             }
             Arc::make_mut(&mut self.decoding).switched.insert(*index, renamed);
         }
-        self.ahead.iter().for_each(Ahead::give_up);
-        Ok(&self.decoding.switched)
+        self.forget_masks();
+        &self.decoding.switched
     }
 
     /// Moves the outlines of masks to where colours change if they are rough (see [`crate::mask_edges`]); true where
@@ -237,7 +289,7 @@ impl FrameStore {
             Ok::<(), TrainError>(())
         })?;
         Arc::make_mut(&mut self.decoding).moves_edges = true;
-        self.ahead.iter().for_each(Ahead::give_up);
+        self.forget_masks();
         Ok(true)
     }
 
@@ -249,7 +301,7 @@ impl FrameStore {
         for renamed in decoding.switched.values_mut() {
             *renamed = renamed.iter().map(|(from, to)| (rename(from), rename(to))).collect();
         }
-        self.ahead.iter().for_each(Ahead::give_up);
+        self.forget_masks();
         for frame in self.frames.iter_mut().filter_map(|(_, frame)| frame.as_mut()) {
             *frame = Arc::new(TrainFrame {
                 image: frame.image.clone(),

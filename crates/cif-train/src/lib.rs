@@ -22,6 +22,7 @@
 //! | `objects` | how rigid objects get poses, before the scene is trained |
 //! | [`heads`] | what the instance stage learns, and how pixels tell it |
 //! | `switches` | which masks show another object than theirs |
+//! | `mask_table` | where masks are, how large, and what they touch, read in one pass |
 //! | `mask_edges` | where the outlines of rough masks belong |
 //! | `sightings` | where masks show objects, and which appear or vanish |
 //! | [`tracks`] | where objects travel, from masks alone |
@@ -65,6 +66,7 @@ mod guidance;
 pub mod heads;
 pub mod losses;
 mod mask_edges;
+mod mask_table;
 #[cfg(test)]
 mod measured;
 pub mod metrics;

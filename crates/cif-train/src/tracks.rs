@@ -5,10 +5,7 @@
 //! distance changes, and real objects neither jump nor change speed without cause. The path is the robust
 //! least-squares solution of all three with the directions in which the mask's centre is seen.
 
-use std::collections::BTreeMap;
-
-use cif_geometry::{PinholeCamera, PixelGrid};
-use cif_render::UNLABELLED;
+use cif_geometry::PinholeCamera;
 use glam::{DMat3, DVec2, DVec3};
 
 mod misfits;
@@ -39,44 +36,6 @@ impl Observation {
     }
 }
 
-/// Observations of the labels in the mask of a frame, without contacts; labels of a few pixels are left out.
-#[must_use]
-pub fn observe(
-    labels: &PixelGrid<u16>,
-    camera: &PinholeCamera,
-    time_index: usize,
-) -> BTreeMap<u16, Observation> {
-    #[derive(Default)]
-    struct Sum {
-        centres: DVec2,
-        pixels: u32,
-        cut: bool,
-    }
-    let mut sums: BTreeMap<u16, Sum> = BTreeMap::new();
-    for y in 0..labels.height {
-        for x in 0..labels.width {
-            let label = *labels.at(x, y);
-            if label == UNLABELLED {
-                continue;
-            }
-            let sum = sums.entry(label).or_default();
-            sum.centres += DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
-            sum.pixels += 1;
-            sum.cut |= x == 0 || y == 0 || x + 1 == labels.width || y + 1 == labels.height;
-        }
-    }
-    let shown = sums.into_iter().filter(|(_, sum)| sum.pixels >= FEWEST_PIXELS);
-    let observation = |sum: Sum| Observation {
-        time_index,
-        camera: *camera,
-        centroid_px: sum.centres / f64::from(sum.pixels),
-        area_px: f64::from(sum.pixels),
-        cut: sum.cut,
-        contact_depth: None,
-    };
-    shown.map(|(label, sum)| (label, observation(sum))).collect()
-}
-
 /// A path of an instance's centre.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Track {
@@ -88,8 +47,6 @@ pub struct Track {
     pub radius: f64,
 }
 
-/// Fewest pixels of a mask that say where an object is.
-const FEWEST_PIXELS: u32 = 12;
 /// Standard deviation of the direction of a mask's centre, in units of the focal length.
 const DIRECTION_SIGMA: f64 = 0.004;
 /// Relative standard deviation of the depth that apparent size and contact say.

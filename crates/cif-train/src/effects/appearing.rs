@@ -10,7 +10,6 @@ use crate::events::TrainEvent;
 use crate::phase::Phase;
 use crate::sightings::Sightings;
 use crate::state::State;
-use crate::tracks::observe;
 
 /// Most views that tell whether an object is there while no mask shows it.
 const LOOKS: usize = 12;
@@ -87,12 +86,11 @@ fn sightings(state: &State) -> Result<Sightings<'_>, TrainError> {
     let mut views: Vec<usize> = (0..state.frames.len()).collect();
     views.sort_by_key(|view| state.dataset.frames[state.frames.index(*view)].time_index);
     let mut sightings = Sightings::default();
+    let masks = state.frames.masks(&state.dataset, &state.phases)?;
     for view in views {
-        state.phases.check()?;
         let frame = &state.dataset.frames[state.frames.index(view)];
-        let data = state.frames.get(&state.dataset, view)?;
-        if let Some(labels) = &data.labels {
-            let seen = observe(labels, &frame.camera, frame.time_index);
+        if let Some(table) = &masks[view] {
+            let seen = table.observations(&frame.camera, frame.time_index);
             sightings.add(&frame.camera_name, frame.time_index, seen);
         }
     }

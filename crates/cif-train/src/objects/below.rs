@@ -8,6 +8,7 @@ use rayon::prelude::*;
 
 use crate::error::TrainError;
 use crate::frames::FrameStore;
+use crate::mask_table::MaskTable;
 use crate::phases::Phases;
 
 /// Frames that are looked at.
@@ -27,13 +28,16 @@ pub(super) fn below(
     frames: &FrameStore,
     phases: &Phases,
 ) -> Result<Vec<DVec3>, TrainError> {
+    let tables = frames.masks(dataset, phases)?;
     let looked: Vec<usize> = (0..frames.len()).step_by(frames.len().div_ceil(LOOKED).max(1)).collect();
     let seen = |k: &usize| {
         phases.check()?;
         let frame = frames.get(dataset, *k)?;
         let camera = &dataset.frames[frames.index(*k)].camera;
-        let Some(labels) = &frame.labels else { return Ok(Vec::new()) };
-        let bands = bands(labels);
+        let Some((labels, table)) = frame.labels.as_ref().zip(tables[*k].as_ref()) else {
+            return Ok(Vec::new());
+        };
+        let bands = bands(labels, table);
         let is_below = |point: &DVec3| camera.pixel_of(*point).is_some_and(|[x, y]| *bands.at(x, y));
         Ok((0..points.len()).filter(|k| is_below(&points[*k])).collect())
     };
@@ -45,20 +49,13 @@ pub(super) fn below(
 }
 
 /// True of unlabelled pixels in the bands below masks, column by column.
-fn bands(labels: &PixelGrid<u16>) -> PixelGrid<bool> {
+fn bands(labels: &PixelGrid<u16>, table: &MaskTable) -> PixelGrid<bool> {
     let (width, height) = (labels.width as usize, labels.height as usize);
-    let most = labels.pixels.iter().copied().max().map_or(0, usize::from);
-    // Of every label, the rows that it has in the whole image: a column may cut off a corner.
-    let mut rows: Vec<Option<[usize; 2]>> = vec![None; most + 1];
-    for (pixel, label) in labels.pixels.iter().enumerate() {
-        let row = pixel / width;
-        let [first, _] = rows[usize::from(*label)].unwrap_or([row; 2]);
-        rows[usize::from(*label)] = Some([first, row]);
-    }
+    // The rows that a label has in the whole image: a column may cut off a corner.
     let band = |label: u16| {
-        let [first, last] = rows[usize::from(label)].unwrap_or_default();
+        let rows = table.rows.get(&label).map_or(0, |row| row.high[1] + 1 - row.low[1]);
         let [least, most] = LIMITS.map(|share| share * height as f64);
-        (BAND * (last + 1 - first) as f64).clamp(least, most).ceil() as usize
+        (BAND * f64::from(rows)).clamp(least, most).ceil() as usize
     };
     let mut bands = PixelGrid::filled(labels.width, labels.height, false);
     for x in 0..width {
@@ -89,7 +86,8 @@ mod tests {
             _ => 0,
         };
         let pixels = (0..100).flat_map(|y| (0..40).map(move |x| label(x, y))).collect();
-        let bands = bands(&PixelGrid::from_pixels(40, 100, pixels));
+        let labels = PixelGrid::from_pixels(40, 100, pixels);
+        let bands = bands(&labels, &MaskTable::of(&labels));
         let rows = |x: usize| (0..100).filter(|y| bands.pixels[y * 40 + x]).collect::<Vec<_>>();
         assert_eq!(rows(15), [50, 51, 54, 55]);
         assert_eq!(rows(11), [45, 46, 47, 48, 49, 50, 51, 54, 55]);

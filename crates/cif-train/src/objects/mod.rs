@@ -165,12 +165,14 @@ fn views_of(
     surroundings: Surroundings<'_>,
 ) -> Result<Vec<ObjectView>, TrainError> {
     let behind = surroundings.order.behind(label);
+    let masks = frames.masks(dataset, surroundings.phases)?;
     let mut views = Vec::new();
-    for k in 0..frames.len() {
+    for (k, table) in masks.iter().enumerate() {
         surroundings.phases.check()?;
+        let Some(table) = table.as_ref().filter(|table| table.rows.contains_key(&label)) else { continue };
         let frame = &dataset.frames[frames.index(k)];
         let data = frames.get(dataset, k)?;
-        views.extend(ObjectView::new((label, &behind), frame.time_index, &frame.camera, &data));
+        views.extend(ObjectView::new((label, &behind), frame.time_index, &frame.camera, &data, table));
     }
     views.sort_by_key(|view| view.time_index);
     view::set_visible(&mut views);

@@ -1,15 +1,14 @@
 //! Which labelled things lie behind an object, so that they cannot hide it: what carries it, or what it passes before.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use cif_dataset::Dataset;
-use cif_geometry::PixelGrid;
 use cif_render::UNLABELLED;
 
 use super::view::median;
 use crate::error::TrainError;
 use crate::frames::FrameStore;
+use crate::mask_table::MaskTable;
 use crate::phases::Phases;
 
 /// Share of the outline that one label has where it surrounds an object, and that counts as touching it.
@@ -48,13 +47,8 @@ impl Order {
     /// When a frame cannot be read, or the run is to stop.
     pub(crate) fn of(dataset: &Dataset, frames: &FrameStore, phases: &Phases) -> Result<Self, TrainError> {
         let labels = dataset.instances.len() + 1;
-        let mut found = Vec::new();
-        for k in 0..frames.len() {
-            phases.check()?;
-            if let Some(grid) = &frames.get(dataset, k)?.labels {
-                found.extend(masks(grid, labels));
-            }
-        }
+        let tables = frames.masks(dataset, phases)?;
+        let found: Vec<Mask> = tables.iter().flatten().flat_map(masks).collect();
         Ok(Self::among(&found, labels))
     }
 
@@ -98,34 +92,23 @@ fn touches_more(mask: &Mask, other: u16) -> bool {
 }
 
 /// Masks of an image.
-fn masks(grid: &PixelGrid<u16>, labels: usize) -> Vec<Mask> {
-    let (width, height) = (grid.width, grid.height);
-    let mut areas = vec![0_u32; labels];
-    let mut outlines: Vec<BTreeMap<u16, u32>> = vec![BTreeMap::new(); labels];
-    for y in 0..height {
-        for x in 0..width {
-            let label = *grid.at(x, y);
-            areas[usize::from(label)] += 1;
-            for (x, y) in [(x.wrapping_sub(1), y), (x + 1, y), (x, y.wrapping_sub(1)), (x, y + 1)] {
-                // The border of the image surrounds nothing.
-                let other = if x < width && y < height { *grid.at(x, y) } else { UNLABELLED };
-                if other != label {
-                    *outlines[usize::from(label)].entry(other).or_default() += 1;
-                }
-            }
+fn masks(table: &MaskTable) -> impl Iterator<Item = Mask> {
+    table.rows.iter().map(|(label, row)| {
+        let mut outline = row.touches.clone();
+        if row.border > 0 {
+            // The border of the image surrounds nothing.
+            *outline.entry(UNLABELLED).or_default() += row.border;
         }
-    }
-    let mask = |(label, (area, outline)): (usize, (u32, BTreeMap<u16, u32>))| {
         let whole = f64::from(outline.values().sum::<u32>());
         let beside = outline.into_iter().map(|(other, pixels)| (other, f64::from(pixels) / whole));
-        Mask { label: label as u16, area: f64::from(area), beside: beside.collect() }
-    };
-    let found = areas.into_iter().zip(outlines).enumerate().skip(1).filter(|(_, (area, _))| *area > 0);
-    found.map(mask).collect()
+        Mask { label: *label, area: f64::from(row.pixels), beside: beside.collect() }
+    })
 }
 
 #[cfg(test)]
 mod tests {
+    use cif_geometry::PixelGrid;
+
     use super::*;
 
     /// Images of a block (1), which passes a screen (3) before or behind it, on a board (2) if there is one.
@@ -142,7 +125,7 @@ mod tests {
             }
             grid
         };
-        (0..13).flat_map(|k| masks(&image(k), 4)).collect()
+        (0..13).flat_map(|k| masks(&MaskTable::of(&image(k))).collect::<Vec<_>>()).collect()
     }
 
     #[test]

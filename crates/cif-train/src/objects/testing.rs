@@ -17,6 +17,7 @@ use super::plane::Plane;
 use super::start::{Object, Surroundings};
 use super::view::{ObjectView, set_visible};
 use crate::frames::TrainFrame;
+use crate::mask_table::MaskTable;
 use crate::phases::Phases;
 use crate::random::{Purpose, stream};
 
@@ -116,8 +117,9 @@ pub(super) fn views_in_masks(
         let image = renderer.render(&field, &camera, time(k), &settings, channels);
         let labels = masks(image.alpha.map(|alpha| u16::from(*alpha > 0.5)));
         let bytes = image.color.map(|c| c.map(|c| (255.0 * c.clamp(0.0, 1.0)).round() as u8));
+        let table = MaskTable::of(&labels);
         let frame = Arc::new(TrainFrame { image: bytes, labels: Some(labels), labelled: 0, features: None });
-        views.extend(ObjectView::new((1, &behind), k, &camera, &frame));
+        views.extend(ObjectView::new((1, &behind), k, &camera, &frame, &table));
     }
     set_visible(&mut views);
     views

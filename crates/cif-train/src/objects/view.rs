@@ -9,13 +9,14 @@ use cif_render::{RenderSettings, UNLABELLED};
 use glam::DVec2;
 
 use crate::frames::TrainFrame;
+use crate::mask_table::MaskTable;
 use crate::tracks::across;
 
 /// Pixels around the mask that belong to its crop.
 const MARGIN: u32 = 5;
 
 /// Masks of fewer pixels say nothing.
-const FEWEST_PIXELS: usize = 12;
+const FEWEST_PIXELS: u32 = 12;
 
 /// Share of a reduced pixel that the mask must have for its colour to count.
 const COLOR_SHARE: f32 = 0.3;
@@ -81,46 +82,32 @@ pub(super) enum Seen {
 }
 
 impl ObjectView {
-    /// The view of a label (dense index + 1), with the labels that are behind it; `None` where it shows too little of
-    /// it.
+    /// The view of a label (dense index + 1), with the labels that are behind it, in a frame with its masks; `None` where
+    /// these show too little of it.
     pub(super) fn new(
         (label, behind): (u16, &Arc<[bool]>),
         time_index: usize,
         camera: &PinholeCamera,
         frame: &Arc<TrainFrame>,
+        table: &MaskTable,
     ) -> Option<Self> {
         let (labels, colors) = (frame.labels.as_ref()?, &frame.image);
         let (width, height) = (labels.width, labels.height);
-        let is_here = |x: u32, y: u32| *labels.at(x, y) == label;
-        let pixels: Vec<[u32; 2]> = (0..height)
-            .flat_map(|y| (0..width).map(move |x| [x, y]))
-            .filter(|[x, y]| is_here(*x, *y))
-            .collect();
-        if pixels.len() < FEWEST_PIXELS {
-            return None;
-        }
-        let (mut low, mut high) = ([u32::MAX; 2], [0; 2]);
-        let mut sum = DVec2::ZERO;
-        let (mut ring, mut touching) = (0_u32, 0_u32);
-        for [x, y] in &pixels {
-            low = [low[0].min(*x), low[1].min(*y)];
-            high = [high[0].max(*x), high[1].max(*y)];
-            sum += DVec2::new(f64::from(*x) + 0.5, f64::from(*y) + 0.5);
-            let beside = [(x.wrapping_sub(1), *y), (x + 1, *y), (*x, y.wrapping_sub(1)), (*x, y + 1)];
-            for (x, y) in beside.into_iter().filter(|(x, y)| *x < width && *y < height) {
-                let other = *labels.at(x, y);
-                ring += u32::from(other != label);
-                touching += u32::from(other != label && !is_behind(behind, other));
-            }
-        }
+        let row = table.rows.get(&label).filter(|row| row.pixels >= FEWEST_PIXELS)?;
+        let (low, high) = (row.low, row.high);
+        let in_box = (low[1]..=high[1]).flat_map(|y| (low[0]..=high[0]).map(move |x| [x, y]));
+        let pixels: Vec<[u32; 2]> = in_box.filter(|[x, y]| *labels.at(*x, *y) == label).collect();
+        let ring: u32 = row.touches.values().sum();
+        let hiding = row.touches.iter().filter(|(other, _)| !is_behind(behind, **other));
+        let touching: u32 = hiding.map(|(_, sides)| sides).sum();
         let centre = camera.centre();
         Some(Self {
             time_index,
             camera_key: (centre * 1e4).round().to_array().map(|value| value as i64),
             camera: *camera,
             size: [width, height],
-            centroid: sum / pixels.len() as f64,
-            cut: low[0] == 0 || low[1] == 0 || high[0] + 1 == width || high[1] + 1 == height,
+            centroid: row.centroid(),
+            cut: row.is_cut(),
             touched: f64::from(touching) / f64::from(ring.max(1)),
             visible: 1.0,
             crops: [1, 2, 4].map(|factor| crop(factor, (label, behind), camera, (low, high), labels, colors)),

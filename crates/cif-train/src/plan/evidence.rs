@@ -8,11 +8,12 @@ use rayon::prelude::*;
 
 use crate::config::MotionConfig;
 use crate::error::TrainError;
+use crate::mask_table::MaskTable;
 use crate::phase::Phase;
 use crate::phases::Phases;
 use crate::sightings::Sightings;
 use crate::switches::{Seen, put_right, switches};
-use crate::tracks::{Observation, misfits, observe, travels};
+use crate::tracks::{Observation, misfits, travels};
 
 /// Masks that are looked at, spread evenly over the training frames.
 const MASKS: usize = 64;
@@ -179,8 +180,10 @@ fn sightings<'a>(
     }
     // As training puts them right.
     let seen = masks.iter().zip(switches(&seen)).map(|(mask, renamed)| put_right(mask, &renamed));
-    let mut seen: Vec<BTreeMap<u16, Observation>> =
-        seen.zip(&frames).map(|(mask, frame)| observe(&mask, &frame.camera, frame.time_index)).collect();
+    let mut seen: Vec<BTreeMap<u16, Observation>> = seen
+        .zip(&frames)
+        .map(|(mask, frame)| MaskTable::of(&mask).observations(&frame.camera, frame.time_index))
+        .collect();
     // A wrong camera shows everything somewhere else, as if it travelled.
     for wrong in misfits(&seen, f64::from(MotionConfig::default().misfit)).into_iter().rev() {
         frames.remove(wrong);

@@ -21,7 +21,7 @@ use crate::phase::Phase;
 use crate::random::{Purpose, stream};
 use crate::stage::Stage;
 use crate::state::State;
-use crate::tracks::{Observation, Track, fit, observe, travels};
+use crate::tracks::{Observation, Track, fit, travels};
 
 /// Share of the nearest depths around a mask that is taken for noise.
 const CONTACT_SHARE: f64 = 0.08;
@@ -58,23 +58,24 @@ impl Trainer {
         let _phase = phases.enter(Phase::Paths, self.state.frames.len());
         let mut renderer = Renderer::new(self.simd);
         let scene = with_contacts.then(|| self.without_outliers()).flatten();
-        for view in 0..self.state.frames.len() {
+        let settings = RenderSettings { deform: false, ..self.state.color_settings() };
+        let masks = self.state.frames.masks(&self.state.dataset, &phases)?;
+        for (view, table) in masks.iter().enumerate() {
             phases.check()?;
             phases.advance();
-            let data = self.state.frames.get(&self.state.dataset, view)?;
-            let Some(labels) = &data.labels else { continue };
-            let settings = RenderSettings { deform: false, ..self.state.color_settings() };
+            let Some(table) = table else { continue };
             let frame = &self.state.dataset.frames[self.state.frames.index(view)];
-            let contacts = with_contacts.then(|| {
+            let mut contacts = vec![None; k];
+            if with_contacts {
                 let scene = scene.as_ref().unwrap_or(&self.state.field);
                 let channels = Channels { depth: true, instances: false };
                 let seen = renderer.render(scene, &frame.camera, frame.time, &settings, channels);
-                contact_depths(labels, &seen, k)
-            });
-            for (label, observation) in observe(labels, &frame.camera, frame.time_index) {
+                let data = self.state.frames.get(&self.state.dataset, view)?;
+                contacts = data.labels.as_ref().map_or(contacts, |labels| contact_depths(labels, &seen, k));
+            }
+            for (label, observation) in table.observations(&frame.camera, frame.time_index) {
                 let of = usize::from(label) - 1;
-                let contact_depth = contacts.as_ref().and_then(|contacts| contacts[of]);
-                observations[of].push(Observation { contact_depth, ..observation });
+                observations[of].push(Observation { contact_depth: contacts[of], ..observation });
             }
         }
         for observations in &mut observations {

@@ -1,11 +1,8 @@
 //! Steps for measuring: one at a time, from any stage, with the instance pass on or off.
 
-use std::sync::Arc;
-
 use cif_dataset::Dataset;
 use cif_field::parameters::LOG_CALIBRATIONS;
 use cif_field::{Field, Identities, Instance};
-use cif_render::UNLABELLED;
 
 use super::evaluate::MeasuredFrames;
 use super::resume::check_instances;
@@ -138,12 +135,11 @@ impl Trainer {
 
     /// Labelled pixels per instance, over all training frames.
     fn count_label_pixels(&self) -> Result<Vec<f64>, TrainError> {
-        let mut pixels = vec![0.0; self.state.field.instances.len()];
-        for view in 0..self.state.frames.len() {
-            let frame = Arc::clone(&self.state.frames.get(&self.state.dataset, view)?);
-            let Some(labels) = &frame.labels else { continue };
-            for label in labels.pixels.iter().filter(|label| **label != UNLABELLED) {
-                pixels[usize::from(*label) - 1] += 1.0;
+        let state = &self.state;
+        let mut pixels = vec![0.0; state.field.instances.len()];
+        for table in state.frames.masks(&state.dataset, &state.phases)?.iter().flatten() {
+            for (label, row) in &table.rows {
+                pixels[usize::from(*label) - 1] += f64::from(row.pixels);
             }
         }
         Ok(pixels)

@@ -234,15 +234,18 @@ impl Trainer {
         let motion = &config.motion;
         let checks = [motion.misfit > 0.0, motion.switches, motion.edges].map(|on| on && has_instances);
         if checks.contains(&true) {
-            let count = checks.iter().filter(|on| **on).count();
-            let _phase = phases.enter(Phase::Masks, count * frames.len());
+            let passes = usize::from(checks[0] || checks[1]) + usize::from(checks[2]);
+            let _phase = phases.enter(Phase::Masks, passes * frames.len());
+            let mut read = Vec::new();
+            if checks[0] || checks[1] {
+                read = frames.read_masks(&dataset, checks[1], &phases)?;
+            }
             if checks[0] {
-                let left_out = frames.leave_out_misfits(&dataset, f64::from(motion.misfit), &phases)?;
+                let left_out = frames.leave_out_misfits(&dataset, &mut read, f64::from(motion.misfit));
                 messages.extend(misfit_warning(&dataset, &left_out));
             }
             if checks[1] {
-                let switched = frames.put_switches_right(&dataset, &phases)?;
-                messages.extend(switch_note(&dataset, switched));
+                messages.extend(switch_note(&dataset, frames.put_switches_right(read)));
             }
             if checks[2] && frames.put_edges_right(&dataset, &phases)? {
                 messages.push(TrainEvent::note(
