@@ -25,10 +25,20 @@ impl TrainConfig {
     /// # Errors
     /// The first setting that cannot work, by key, with what it takes.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        let (stages, model, rates) = (&self.stages, &self.model, &self.rates);
-        let (densify, identity, instance, resample) =
-            (&self.densify, &self.identity, &self.instance, &self.resample);
+        self.validate_run()?;
+        self.validate_model()?;
+        self.validate_rates()?;
+        self.validate_effects()?;
+        self.validate_gaussians()?;
+        self.validate_instances()?;
+        self.validate_relocation()?;
+        at_least("report.step_every", self.report.step_every, 1, "expected at least 1")?;
+        at_least("report.evaluate_frames", self.report.evaluate_frames, 1, "expected at least 1")
+    }
 
+    /// What is trained on, and for how long.
+    fn validate_run(&self) -> Result<(), ConfigError> {
+        let stages = &self.stages;
         for (channel, value) in self.background.iter().enumerate() {
             let key = ["background[0]", "background[1]", "background[2]"][channel];
             within(key, *value, 0.0..=1.0, "expected a number in [0, 1]")?;
@@ -62,7 +72,12 @@ impl TrainConfig {
             "empty",
             "expected the folder of feature maps that 4d-langsplat learns: --set head.maps=DIR",
         )?;
+        Ok(())
+    }
 
+    /// Gaussians and deformation at their start.
+    fn validate_model(&self) -> Result<(), ConfigError> {
+        let model = &self.model;
         at_least("model.max_initial_points", model.max_initial_points, 1, "expected at least 1")?;
         open_unit("model.initial_opacity", model.initial_opacity)?;
         for (axis, nodes) in model.spatial_resolution.iter().enumerate() {
@@ -88,7 +103,13 @@ impl TrainConfig {
         check((1..=128).contains(&model.channels), "model.channels", model.channels, "expected 1 to 128")?;
         check((1..=1024).contains(&model.width), "model.width", model.width, "expected 1 to 1024")?;
         check(model.sh_degree <= 3, "model.sh_degree", model.sh_degree, "expected 0 to 3")?;
+        Ok(())
+    }
 
+    /// Rates, weights and limits that are at least 0.
+    fn validate_rates(&self) -> Result<(), ConfigError> {
+        let (rates, densify) = (&self.rates, &self.densify);
+        let (identity, resample) = (&self.identity, &self.resample);
         let scheduled =
             [("rates.means", rates.means), ("rates.planes", rates.planes), ("rates.mlp", rates.mlp)];
         for (key, pair) in scheduled {
@@ -129,6 +150,11 @@ impl TrainConfig {
         ] {
             check(rate.is_finite() && rate >= 0.0, key, rate, "expected a finite number of at least 0")?;
         }
+        Ok(())
+    }
+
+    /// Losses, motion and effects.
+    fn validate_effects(&self) -> Result<(), ConfigError> {
         within("loss.lambda_dssim", self.loss.lambda_dssim, 0.0..=1.0, "expected a number in [0, 1]")?;
 
         within("motion.guidance_end", self.motion.guidance_end, 0.0..=1.0, "expected a number in [0, 1]")?;
@@ -136,7 +162,12 @@ impl TrainConfig {
 
         within("effects.still_from", self.effects.still_from, 0.0..=1.0, "expected a number in [0, 1]")?;
         within("effects.still_awake", self.effects.still_awake, 0.0..=1.0, "expected a number in [0, 1]")?;
+        Ok(())
+    }
 
+    /// The set of Gaussians, and whose they are.
+    fn validate_gaussians(&self) -> Result<(), ConfigError> {
+        let (densify, identity) = (&self.densify, &self.identity);
         at_least("densify.every", densify.every, 1, "expected at least 1")?;
         at_least("densify.max_gaussians", densify.max_gaussians, 1, "expected at least 1")?;
         within("densify.prune_opacity", densify.prune_opacity, 0.0..=0.99, "expected a number in [0, 0.99]")?;
@@ -146,7 +177,12 @@ impl TrainConfig {
         within("identity.truncation", identity.truncation, 0.0..=0.5, "expected a number in [0, 0.5]")?;
         at_least("identity.neighbours", identity.neighbours, 1, "expected at least 1")?;
         open_unit("identity.unseen_occupancy", identity.unseen_occupancy)?;
+        Ok(())
+    }
 
+    /// Occupancy and calibration.
+    fn validate_instances(&self) -> Result<(), ConfigError> {
+        let instance = &self.instance;
         open_unit("instance.occupancy", instance.occupancy)?;
         let [low, high] = instance.occupancy_limits;
         check(
@@ -162,7 +198,12 @@ impl TrainConfig {
             "constant-occupancy with opacity-occupancy",
             "expected at most one of the two",
         )?;
+        Ok(())
+    }
 
+    /// Relocation of Gaussians.
+    fn validate_relocation(&self) -> Result<(), ConfigError> {
+        let resample = &self.resample;
         at_least("resample.every", resample.every, 1, "expected at least 1")?;
         within("resample.rate", resample.rate, 0.0..=0.5, "expected a number in [0, 0.5]")?;
         check(
@@ -177,8 +218,7 @@ impl TrainConfig {
             resample.weak_share,
             "expected a number in (0, 1]",
         )?;
-        at_least("report.step_every", self.report.step_every, 1, "expected at least 1")?;
-        at_least("report.evaluate_frames", self.report.evaluate_frames, 1, "expected at least 1")
+        Ok(())
     }
 }
 
