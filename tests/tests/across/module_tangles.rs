@@ -21,7 +21,7 @@ const MOST: [(&str, usize); 19] = [
     ("cif-render", 10),
     ("cif-masks", 9),
     ("cif-capture", 14),
-    ("cif-train", 38),
+    ("cif-train", 36),
     ("cif-scene", 2),
     ("cif-usd", 0),
     ("cif-gltf", 5),

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::EffectKind;
+use super::effect::EffectKind;
 
 /// Where the decisions start from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -1,4 +1,5 @@
 use super::*;
+use crate::config::ObjectMotion;
 
 fn found() -> Evidence {
     Evidence {
