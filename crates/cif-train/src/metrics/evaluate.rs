@@ -1,6 +1,6 @@
 //! Renders the held-out frames of a capture and scores them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -192,19 +192,7 @@ pub fn evaluate<E: From<EvaluationError>>(
             exposed_frames += 1;
         }
         let predicted = rendered.instances.as_ref().map(|instances| mask_ids(field, &instances.label));
-        let confusion = match (&truth.mask, &predicted) {
-            (Some(mask), Some(predicted)) => {
-                let of = |predicted: &PixelGrid<u16>| {
-                    FrameConfusion::new(&frame.camera_name, frame.time_index, mask, predicted)
-                };
-                let layers = rendered.instances.as_ref().expect("ids are predicted by instances");
-                Some(Confusions {
-                    labelled: of(predicted),
-                    panoptic: of(&with_background(predicted, &layers.foreground)),
-                })
-            }
-            _ => None,
-        };
+        let confusion = confusions_of(frame, &truth, &rendered, predicted.as_ref());
         let target = unit_color(&truth.image);
         let shown = training_views.as_ref().map(|views| views.show(&frame.camera, &rendered));
         if !options.depth {
@@ -243,19 +231,7 @@ pub fn evaluate<E: From<EvaluationError>>(
         };
         return Err(EvaluationError::NoFrames { root: dataset.root.clone(), split }.into());
     }
-    let select = |group: Option<&str>| {
-        let chosen = |scores: &FrameScores| group.is_none() || scores.group.as_deref() == group;
-        let confusions: Vec<Confusions> = frames
-            .iter()
-            .zip(&confusions)
-            .filter(|(scores, _)| chosen(scores))
-            .filter_map(|(_, confusion)| confusion.clone())
-            .collect();
-        scores_of(frames.iter().filter(|scores| chosen(scores)), &confusions)
-    };
-    let names: std::collections::BTreeSet<&str> = frames.iter().filter_map(|f| f.group.as_deref()).collect();
-    let groups = names.into_iter().map(|name| (name.to_owned(), select(Some(name)))).collect();
-    let overall = select(None);
+    let (overall, groups) = summed_up(&frames, &confusions);
     let render_ms_per_frame = frames.iter().map(|f| f.render_ms).sum::<f64>() / frames.len() as f64;
     Ok(Evaluation {
         overall,
@@ -265,6 +241,44 @@ pub fn evaluate<E: From<EvaluationError>>(
         frames,
         exposed_frames: (!exposures.is_empty()).then_some(exposed_frames),
     })
+}
+
+/// Confusions of a frame; `None` without a mask, or without predicted ids.
+fn confusions_of(
+    frame: &Frame,
+    truth: &FrameData,
+    rendered: &RenderedImage,
+    predicted: Option<&PixelGrid<u16>>,
+) -> Option<Confusions> {
+    let (mask, predicted) = truth.mask.as_ref().zip(predicted)?;
+    let layers = rendered.instances.as_ref()?;
+    let of = |predicted: &PixelGrid<u16>| {
+        FrameConfusion::new(&frame.camera_name, frame.time_index, mask, predicted)
+    };
+    Some(Confusions {
+        labelled: of(predicted),
+        panoptic: of(&with_background(predicted, &layers.foreground)),
+    })
+}
+
+/// Scores of all frames, and of each group of them.
+fn summed_up(
+    frames: &[FrameScores],
+    confusions: &[Option<Confusions>],
+) -> (Scores, BTreeMap<String, Scores>) {
+    let select = |group: Option<&str>| {
+        let chosen = |scores: &FrameScores| group.is_none() || scores.group.as_deref() == group;
+        let confusions: Vec<Confusions> = frames
+            .iter()
+            .zip(confusions)
+            .filter(|(scores, _)| chosen(scores))
+            .filter_map(|(_, confusion)| confusion.clone())
+            .collect();
+        scores_of(frames.iter().filter(|scores| chosen(scores)), &confusions)
+    };
+    let names: BTreeSet<&str> = frames.iter().filter_map(|f| f.group.as_deref()).collect();
+    let groups = names.into_iter().map(|name| (name.to_owned(), select(Some(name)))).collect();
+    (select(None), groups)
 }
 
 /// The settings that a field was trained with; `None` for a field of other origin.
