@@ -38,6 +38,15 @@ pub struct StageShare {
     pub weight: f64,
 }
 
+/// Work to come that is no step of a stage.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct OtherWork {
+    /// Frames that identity estimation still has to pass over.
+    pub identity_frames: usize,
+    /// True where objects are fitted behind the present stage.
+    pub has_fits: bool,
+}
+
 /// Weights of the stages for [`Pacer::enter`]: `steps` of each, in order.
 #[must_use]
 pub(crate) fn weights(steps: &[(Stage, u32)]) -> Vec<StageShare> {
@@ -88,21 +97,15 @@ impl Pacer {
         (self.end() - self.budget.used(now)).max(0.0)
     }
 
-    /// Begins the first of `stages`, which are all that are left and have steps; `identity_frames` are those
-    /// that identity estimation still has to pass over, `has_fits` is true where objects are fitted after the stage.
-    pub fn enter(
-        &mut self,
-        stages: &[StageShare],
-        iteration: u32,
-        (identity_frames, has_fits): (usize, bool),
-        now: Seconds,
-    ) {
+    /// Begins the first of `stages`, which are all that are left and have steps, after `iteration` of its steps.
+    pub fn enter(&mut self, stages: &[StageShare], iteration: u32, other: OtherWork, now: Seconds) {
         let used = self.budget.used(now);
         let whole: f64 = stages.iter().map(|share| share.weight).sum();
         let mine = stages.first().map_or(0.0, |share| share.weight);
-        let left = self.left(now) * if has_fits { 1.0 - FITS } else { 1.0 };
+        let left = self.left(now) * if other.has_fits { 1.0 - FITS } else { 1.0 };
         // A coarse step costs less than a fine one, so that this is too little rather than too much.
-        let identity = self.cost.map_or(0.0, |cost| cost * IDENTITY_STEPS_PER_FRAME) * identity_frames as f64;
+        let identity =
+            self.cost.map_or(0.0, |cost| cost * IDENTITY_STEPS_PER_FRAME) * other.identity_frames as f64;
         let left = (left - identity.min(0.2 * left)).max(0.0);
         self.deadline = used + if whole > 0.0 { left * mine / whole } else { left };
         self.look = (used, iteration);
@@ -163,8 +166,8 @@ mod tests {
             if share.stage == Stage::Instance {
                 now += identity;
             }
-            let frames = if share.stage == Stage::Instance { 0 } else { 100 };
-            pacer.enter(&shares[k..], 0, (frames, false), at(now));
+            let identity_frames = if share.stage == Stage::Instance { 0 } else { 100 };
+            pacer.enter(&shares[k..], 0, OtherWork { identity_frames, has_fits: false }, at(now));
             let (mut iteration, mut steps) = (0, 1_000);
             while iteration < steps {
                 iteration += 1;

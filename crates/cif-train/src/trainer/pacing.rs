@@ -7,7 +7,7 @@
 use serde_json::{Value, json};
 
 use super::Trainer;
-use crate::budget::{Budget, FITS, Pacer, REHEARSAL, TRIALS, weights};
+use crate::budget::{Budget, FITS, OtherWork, Pacer, REHEARSAL, TRIALS, weights};
 use crate::curve::{CurvePoint, Targets};
 use crate::error::TrainError;
 use crate::phase::Phase;
@@ -96,11 +96,13 @@ impl Trainer {
             })
             .filter(|(other, steps)| *steps > 0 || *other == stage)
             .collect();
-        let frames = self.frames_of_identities(stage);
-        let has_fits = stage == Stage::Coarse && self.objects_to_fit() > 0;
+        let other = OtherWork {
+            identity_frames: self.frames_of_identities(stage),
+            has_fits: stage == Stage::Coarse && self.objects_to_fit() > 0,
+        };
         let (iteration, now) = (self.state.progress.iteration, self.state.phases.now());
         let Some(pacing) = &mut self.pacing else { return };
-        pacing.pacer.enter(&weights(&steps), iteration, (frames, has_fits), now);
+        pacing.pacer.enter(&weights(&steps), iteration, other, now);
     }
 
     /// Frames that identity estimation passes over behind a stage.
