@@ -347,7 +347,7 @@ fn motion(found: &Evidence) -> (bool, String) {
 }
 
 /// The motion that is tried for every instance, and why: training decides between poses and the network.
-fn objects(found: &Evidence, config: &TrainConfig) -> (String, String) {
+pub(super) fn objects(found: &Evidence, config: &TrainConfig) -> (String, String) {
     let told = &config.motion.of;
     let untold: Vec<&str> =
         found.travelling.iter().map(String::as_str).filter(|label| !told.contains_key(*label)).collect();

@@ -1,3 +1,4 @@
+use super::decide::objects;
 use super::*;
 use crate::config::ObjectMotion;
 

@@ -149,7 +149,7 @@ fn switch_note(dataset: &Dataset, switched: &BTreeMap<usize, BTreeMap<u16, u16>>
 
 /// Trains one field on one capture.
 pub struct Trainer {
-    state: State,
+    pub(crate) state: State,
     /// Adds and removes Gaussians.
     density: Arc<dyn Strategy>,
     /// Effects that are judged while it trains, in order.

@@ -114,7 +114,7 @@ impl Trainer {
     }
 
     /// The run at the judgement of effects that falls on a step of a stage.
-    pub(super) fn at_judgement<'a>(
+    pub(crate) fn at_judgement<'a>(
         &'a mut self,
         stage: Stage,
         iteration: u32,
