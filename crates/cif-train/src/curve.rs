@@ -62,7 +62,10 @@ pub struct CurvePoint {
     pub psnr: Option<f64>,
     /// Mean SSIM.
     pub ssim: Option<f64>,
-    /// mIoU, percent; none before identities exist or without masks.
+    /// Mean IoU over the whole image, percent; none before identities exist or without masks, and in older scenes.
+    #[serde(default)]
+    pub iou: Option<f64>,
+    /// mIoU over labelled pixels alone, percent; none before identities exist or without masks.
     pub miou: Option<f64>,
 }
 
@@ -160,6 +163,7 @@ mod tests {
             gaussians: 1,
             psnr: Some(psnr),
             ssim: None,
+            iou: None,
             miou: None,
         }
     }

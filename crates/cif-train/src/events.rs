@@ -192,7 +192,9 @@ pub enum TrainEvent {
         psnr: Option<f64>,
         /// Mean SSIM.
         ssim: Option<f64>,
-        /// mIoU, percent; none before identities exist or without masks.
+        /// Mean IoU over the whole image, percent; none before identities exist or without masks.
+        iou: Option<f64>,
+        /// mIoU over labelled pixels alone, percent.
         miou: Option<f64>,
         /// mAcc-pix, percent.
         macc_pix: Option<f64>,

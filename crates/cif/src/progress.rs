@@ -28,7 +28,7 @@ pub struct Progress {
     bar: Option<ProgressBar>,
     quiet: bool,
     last_line: Option<Instant>,
-    miou: Option<f64>,
+    iou: Option<f64>,
     start: Instant,
     log: Log,
     log_failure: Option<Error>,
@@ -71,7 +71,7 @@ impl Progress {
             bar,
             quiet,
             last_line: None,
-            miou: None,
+            iou: None,
             start: Instant::now(),
             log: Log::Undecided(Vec::new()),
             log_failure: None,
@@ -131,9 +131,9 @@ impl Progress {
                 eta_s,
                 ..
             } => {
-                let miou = self.miou.map_or(String::new(), |miou| format!("  mIoU {miou:.1}"));
+                let iou = self.iou.map_or(String::new(), |iou| format!("  IoU {iou:.1}"));
                 let message = format!(
-                    "{iterations_per_second:.1} it/s  ETA {}  loss {loss:.4}  {gaussians} Gaussians  PSNR {psnr:.2}{miou}",
+                    "{iterations_per_second:.1} it/s  ETA {}  loss {loss:.4}  {gaussians} Gaussians  PSNR {psnr:.2}{iou}",
                     duration(*eta_s)
                 );
                 if self.is_line_due() || iteration == iterations {
@@ -150,19 +150,19 @@ impl Progress {
                     self.line(&format!("warning: no Gaussian belongs to mask id {}", ids.join(", ")));
                 }
             }
-            TrainEvent::Evaluated { stage, iteration, frames, psnr, miou, .. } => {
-                self.miou = miou.or(self.miou);
+            TrainEvent::Evaluated { stage, iteration, frames, psnr, iou, .. } => {
+                self.iou = iou.or(self.iou);
                 self.line(&format!(
-                    "{stage} {iteration}: {frames} held-out frames, PSNR {}, mIoU {}",
+                    "{stage} {iteration}: {frames} held-out frames, PSNR {}, IoU {}",
                     optional(*psnr),
-                    optional(*miou)
+                    optional(*iou)
                 ));
             }
             TrainEvent::RolledBack { stage, iteration, fault, in_a_row, .. } => {
                 let repeated = if *in_a_row > 1 { format!(" ({in_a_row} in a row)") } else { String::new() };
                 self.line(&format!("warning: {stage} {iteration} rolled back{repeated}: {fault}"));
             }
-            TrainEvent::Measured { point, .. } => self.miou = point.miou.or(self.miou),
+            TrainEvent::Measured { point, .. } => self.iou = point.iou.or(self.iou),
             TrainEvent::Warning { message } => self.line(&format!("warning: {message}")),
             TrainEvent::Note { message } => self.line(&format!("note: {message}")),
             TrainEvent::Finished { iterations, gaussians, psnr, peak_rss_mb, rolled_back, .. } => {

@@ -7,7 +7,8 @@
 //! still go through the network all the same. Where these learn to move, their neighbours are handed back. Where all
 //! cameras stay in place, their images tell from the start: what they see change stays in the network for half of the
 //! fine stage, and the rest leaves it at once. Where masks tell which objects travel, the same holds for these from
-//! an early step of a long stage on, provided that it hardly shows; what else moves is then handed back.
+//! an early step of a long stage on, provided that it hardly shows; what else moves is then handed back. What shows is
+//! judged by motion that goes on between images, see [`Bench::errors_of_motion`].
 
 use cif_field::Field;
 use rand::RngExt;
@@ -53,7 +54,7 @@ impl Effect for Still {
     /// move.
     fn judge(&self, bench: &mut Bench<'_>) -> Result<(), TrainError> {
         let Some(evidence) = Evidence::of(bench)? else { return Ok(()) };
-        let mut error = bench.error(None)?;
+        let mut error = bench.errors_of_motion(None)?.all.mean();
         let mut settled = None;
         if bench.moment().has(Due::StillByMasks) {
             let stands = |row: usize| !evidence.watched[row] && !evidence.travels[row];
@@ -155,7 +156,7 @@ fn hand_back(bench: &mut Bench<'_>, evidence: &Evidence, error: f64) -> Result<u
     let mut released = wake(&mut trial, motions, |row| !highest.scaled(RELEASE).hold(&motions[row]));
     let woken = released + wake(&mut trial, motions, |row| awake[row]);
     // Where nothing is trained, the network may do anything: what it says must fit the pictures.
-    if woken > 0 && gain(bench.error(Some(&trial))?, error) > allowed {
+    if woken > 0 && gain(bench.errors_of_motion(Some(&trial))?.all.mean(), error) > allowed {
         trial = bench.state.field.clone();
         released = 0;
         wake(&mut trial, motions, |row| watched[row] && highest.hold(&motions[row]));
@@ -176,7 +177,7 @@ fn try_to_settle(
     let mut trial = bench.state.field.clone();
     let found = put_to_rest(&mut trial, motions, wanted);
     if found > 0 {
-        let after = bench.error(Some(&trial))?;
+        let after = bench.errors_of_motion(Some(&trial))?.all.mean();
         if gain(after, *error) > allowed {
             return Ok(None);
         }

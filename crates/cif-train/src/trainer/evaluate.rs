@@ -12,6 +12,7 @@ use crate::error::TrainError;
 use crate::events::TrainEvent;
 use crate::metrics::evaluate::mask_ids;
 use crate::metrics::image::{psnr, ssim, unit_color};
+use crate::metrics::panoptic::{panoptic_metrics, with_background};
 use crate::metrics::{FrameConfusion, instance_metrics};
 use crate::phase::Phase;
 use crate::stage::Stage;
@@ -35,6 +36,7 @@ pub(super) struct MeasuredFrames {
 struct MeanScores {
     psnr: Option<f64>,
     ssim: Option<f64>,
+    iou: Option<f64>,
     miou: Option<f64>,
     macc_pix: Option<f64>,
 }
@@ -108,6 +110,7 @@ impl Trainer {
             frames: count,
             psnr: scores.psnr,
             ssim: scores.ssim,
+            iou: scores.iou,
             miou: scores.miou,
             macc_pix: scores.macc_pix,
         })
@@ -154,6 +157,7 @@ impl Trainer {
             gaussians: self.state.field.gaussians.len(),
             psnr: scores.psnr,
             ssim: scores.ssim,
+            iou: scores.iou,
             miou: scores.miou,
         };
         let count = frames.len();
@@ -186,14 +190,16 @@ impl Trainer {
             let target = unit_color(&truth.image);
             psnrs.push(psnr(&rendered.color, &target).min(MAX_PSNR));
             ssims.push(ssim(&rendered.color, &target));
-            labels.push(rendered.instances.map(|instances| instances.label));
+            labels.push(rendered.instances.map(|instances| (instances.label, instances.foreground)));
         })?;
-        let mut confusions = Vec::new();
+        let (mut confusions, mut with_backgrounds) = (Vec::new(), Vec::new());
         for ((index, truth), labels) in frames.iter().zip(labels) {
-            if let (Some(mask), Some(labels)) = (&truth.mask, labels) {
+            if let (Some(mask), Some((labels, foreground))) = (&truth.mask, labels) {
                 let frame = &self.state.dataset.frames[*index];
                 let predicted = mask_ids(&self.state.field, &labels);
-                confusions.push(FrameConfusion::new(&frame.camera_name, frame.time_index, mask, &predicted));
+                let of = |ids| FrameConfusion::new(&frame.camera_name, frame.time_index, mask, ids);
+                confusions.push(of(&predicted));
+                with_backgrounds.push(of(&with_background(&predicted, &foreground)));
             }
         }
         let mean =
@@ -202,6 +208,7 @@ impl Trainer {
         Ok(MeanScores {
             psnr: mean(&psnrs),
             ssim: mean(&ssims),
+            iou: panoptic_metrics(&with_backgrounds).iou,
             miou: scores.miou,
             macc_pix: scores.macc_pix,
         })

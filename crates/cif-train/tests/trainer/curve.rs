@@ -63,8 +63,16 @@ fn a_run_records_its_curve_and_ends_as_without_it() {
     assert_eq!(curve.measuring.wall_s, 6.0 * 0.25);
     assert_eq!(trainer.time_of_training().wall_s, 365.0);
     assert_eq!((curve.frames, curve.frame_names.len()), (CurveFrames::HeldOut, 3));
-    assert!(curve.points[..3].iter().all(|point| point.miou.is_none() && point.psnr > Some(10.0)));
-    assert!(curve.points[3..].iter().all(|point| point.miou > Some(30.0) && point.ssim > Some(0.3)));
+    assert!(
+        curve.points[..3]
+            .iter()
+            .all(|point| point.miou.is_none() && point.iou.is_none() && point.psnr > Some(10.0))
+    );
+    assert!(
+        curve.points[3..]
+            .iter()
+            .all(|point| point.miou > Some(30.0) && point.iou > Some(10.0) && point.ssim > Some(0.3))
+    );
     let recorded: Curve = serde_json::from_value(trainer.field().record.curve.clone().unwrap()).unwrap();
     assert_eq!(recorded, curve);
     let record = trainer.field().record.to_json()["train"].clone();

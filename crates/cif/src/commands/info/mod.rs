@@ -240,6 +240,7 @@ fn print_curve(curve: &Value) {
         "Gaussians",
         "PSNR dB",
         "SSIM",
+        "IoU %",
         "mIoU %",
     ]);
     let number = |value: Option<f64>, digits| value.map_or("n/a".to_owned(), |v| format!("{v:.digits$}"));
@@ -252,6 +253,7 @@ fn print_curve(curve: &Value) {
             point.gaussians.to_string(),
             number(point.psnr, 2),
             number(point.ssim, 4),
+            number(point.iou, 1),
             number(point.miou, 1),
         ]);
     }
