@@ -220,8 +220,8 @@ impl FrameStore {
         (0..self.len()).into_par_iter().map(read).collect()
     }
 
-    /// Leaves out the training frames whose masks contradict the others (see [`misfits`]), also of what was `read`; their
-    /// indices in the capture.
+    /// Leaves out the training frames whose masks contradict the others (see [`misfits`]), also of what was `read`;
+    /// their indices in the capture.
     pub(crate) fn leave_out_misfits(
         &mut self,
         dataset: &Dataset,
@@ -244,8 +244,8 @@ impl FrameStore {
         left_out
     }
 
-    /// Puts right the masks that show other objects by what was `read` of them (see [`crate::switches`]); the new labels
-    /// of masks by old ones, by index in the capture.
+    /// Puts right the masks that show other objects by what was `read` of them (see [`crate::switches`]); the new
+    /// labels of masks by old ones, by index in the capture.
     pub(crate) fn put_switches_right(
         &mut self,
         read: Vec<ReadMasks>,
@@ -362,6 +362,23 @@ impl TrainFrame {
 mod tests {
     use super::*;
     use crate::trainer::guard_tests::support::{HEIGHT, Scene, WIDTH, capture};
+
+    #[test]
+    fn masks_are_read_once_until_they_change() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), Scene { times: 2, views: 2, ..Scene::default() });
+        let phases = Phases::default();
+        let mut store = FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), u64::MAX, &phases).unwrap();
+        let masks = store.masks(&dataset, &phases).unwrap();
+        assert!(Arc::ptr_eq(&masks, &store.masks(&dataset, &phases).unwrap()));
+        let tables =
+            (0..store.len()).map(|k| store.get(&dataset, k).unwrap().labels.as_ref().map(MaskTable::of));
+        assert!(tables.eq(masks.iter().cloned()) && masks[0].as_ref().unwrap().rows.len() == 3);
+        store.relabel(|label| label + 5);
+        let renamed = store.masks(&dataset, &phases).unwrap();
+        let labels = |masks: &FrameMasks| masks[0].as_ref().unwrap().rows.keys().copied().collect::<Vec<_>>();
+        assert_eq!((labels(&masks), labels(&renamed)), (vec![1, 2, 3], vec![6, 7, 8]));
+    }
 
     #[test]
     fn unsure_pixels_are_unlabelled_and_the_others_keep_their_labels() {

@@ -1,5 +1,5 @@
-//! Masks as numbers: what every label of a frame covers, read in one pass over its pixels. Whoever asks where masks are, how
-//! large, or what they touch asks these tables.
+//! Masks as numbers: what every label of a frame covers, read in one pass over its pixels. Whoever asks where masks
+//! are, how large, or what they touch asks these tables.
 
 use std::collections::BTreeMap;
 

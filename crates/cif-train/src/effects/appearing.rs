@@ -31,8 +31,8 @@ pub(crate) struct Posed {
     pub group: u32,
 }
 
-/// Hides objects before they appear and after they vanish inside the view, by their masks, where the images are explained
-/// better without them; returns what there is to say about it.
+/// Hides objects before they appear and after they vanish inside the view, by their masks, where the images are
+/// explained better without them; returns what there is to say about it.
 pub(crate) fn hide_absent(
     state: &mut State,
     simd: SimdLevel,

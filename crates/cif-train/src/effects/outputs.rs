@@ -1,5 +1,5 @@
-//! Optional outputs of the deformation network, judged once, at half of the fine stage: sooner they have not learnt what
-//! they are worth, and later nothing is left to make good for what is taken back.
+//! Optional outputs of the deformation network, judged once, at half of the fine stage: sooner they have not learnt
+//! what they are worth, and later nothing is left to make good for what is taken back.
 
 use cif_field::deformation::HeadKind;
 use cif_field::parameters::MLP;

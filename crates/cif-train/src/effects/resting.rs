@@ -25,8 +25,8 @@ const TREMBLING_LOSSES: [f64; 2] = [8.0, 0.3];
 /// Share of its image on labelled pixels from which a Gaussian may leave with its instance.
 const LABELLED_SHARE: f32 = 0.2;
 
-/// Puts to rest what the network moves of every instance whose pixels allow it; returns the number of Gaussians. It does
-/// nothing before identities are estimated.
+/// Puts to rest what the network moves of every instance whose pixels allow it; returns the number of Gaussians. It
+/// does nothing before identities are estimated.
 pub(crate) fn rest_instances(bench: &mut Bench<'_>, motions: &[Motion]) -> Result<usize, TrainError> {
     let instance_of = rows_of_instances(&bench.state.field);
     let mut resting = may_rest(bench.state, &instance_of);

@@ -82,8 +82,8 @@ pub(super) enum Seen {
 }
 
 impl ObjectView {
-    /// The view of a label (dense index + 1), with the labels that are behind it, in a frame with its masks; `None` where
-    /// these show too little of it.
+    /// The view of a label (dense index + 1), with the labels that are behind it, in a frame with its masks; `None`
+    /// where these show too little of it.
     pub(super) fn new(
         (label, behind): (u16, &Arc<[bool]>),
         time_index: usize,

@@ -215,6 +215,7 @@ fn rows_that_stay_on_the_device_end_as_those_that_the_host_rearranges() {
     let Some(gpu) = testing::gpu() else { return };
     let run = |fetches: bool| {
         let (mut trainer, _folder) = trainer(Some(&gpu));
+        trainer.enter(Stage::Coarse).unwrap();
         // Half of them are large; opacities that fall, from 0.1 or where they are reset to, go.
         let mut sizes: Vec<f32> =
             trainer.state.field.gaussians.log_scales.iter().map(|s| s[0].max(s[1]).max(s[2]).exp()).collect();

@@ -148,7 +148,10 @@ impl Trainer {
         if requests.stop || self.state.phases.is_stopped() {
             return Ok(Outcome::Interrupted);
         }
-        if self.state.config.report.checkpoint_seconds > 0 {
+        let seconds = self.state.config.report.checkpoint_seconds;
+        // A search that was short is as soon done again as saved.
+        let is_due = stage != Stage::Search || self.saving.is_due(seconds, self.now_s());
+        if seconds > 0 && is_due {
             self.count_stage_time();
             self.request_checkpoint(observer, requests);
         }

@@ -39,7 +39,8 @@ impl Trainer {
     fn try_step(&mut self, events: &mut Vec<TrainEvent>) -> Result<StepLoss, TrainError> {
         let start = Instant::now();
         let (stage, iteration) = (self.state.progress.stage, self.state.progress.iteration + 1);
-        for effect in self.due_effects(Place::Before, &self.coming()) {
+        for (effect, _) in self.effects_at(Place::Before, &self.coming()).into_iter().filter(|(_, due)| *due)
+        {
             self.fetch()?;
             self.judge(&*effect, stage, iteration, events)?;
         }
@@ -106,11 +107,11 @@ impl Trainer {
         draw(&mut self.engine, &mut self.state, self.simd, trial, views, each)
     }
 
-    /// Effects that are judged at a place around a step.
-    fn due_effects(&self, place: Place, step: &Moment<'_>) -> Vec<Arc<dyn Effect>> {
+    /// Effects that have their place around a step, and whether they are judged there.
+    fn effects_at(&self, place: Place, step: &Moment<'_>) -> Vec<(Arc<dyn Effect>, bool)> {
         let standing = Standing { field: &self.state.field, progress: &self.state.progress };
-        let is_due = |effect: &&Arc<dyn Effect>| effect.place() == place && effect.due(step, &standing);
-        self.effects.iter().filter(is_due).cloned().collect()
+        let here = self.effects.iter().filter(|effect| effect.place() == place);
+        here.map(|effect| (Arc::clone(effect), effect.due(step, &standing))).collect()
     }
 
     /// The run at the judgement of effects that falls on a step of a stage.
@@ -186,8 +187,9 @@ impl Trainer {
         let iteration = self.state.progress.iteration;
         let due = self.done().all();
         let falls = |what: Due| due.contains(&what);
-        let judged = self.due_effects(Place::Behind, &self.done());
-        if !judged.is_empty() || falls(Due::EstimateIdentities) || self.engine.is_far_ahead() {
+        let effects = self.effects_at(Place::Behind, &self.done());
+        let judges = effects.iter().any(|(_, due)| *due);
+        if judges || falls(Due::EstimateIdentities) || self.engine.is_far_ahead() {
             self.fetch()?;
         }
         if self.state.progress.after_step == Some(AfterStep::Changes) {
@@ -199,15 +201,13 @@ impl Trainer {
             }
             self.state.progress.after_step = Some(AfterStep::effect(0));
         }
-        let behind = self.effects.iter().filter(|effect| effect.place() == Place::Behind);
-        for (k, effect) in behind.cloned().collect::<Vec<_>>().into_iter().enumerate() {
-            if self.state.progress.after_step != Some(AfterStep::effect(k)) {
-                continue;
+        for (k, (effect, due)) in effects.into_iter().enumerate() {
+            if self.state.progress.after_step == Some(AfterStep::effect(k)) {
+                if due {
+                    self.judge_wholly(&*effect, stage, iteration, events)?;
+                }
+                self.state.progress.after_step = Some(AfterStep::effect(k + 1));
             }
-            if judged.iter().any(|due| Arc::ptr_eq(due, &effect)) {
-                self.judge_wholly(&*effect, stage, iteration, events)?;
-            }
-            self.state.progress.after_step = Some(AfterStep::effect(k + 1));
         }
         self.state.progress.after_step = None;
         Ok(())

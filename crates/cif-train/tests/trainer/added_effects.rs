@@ -11,15 +11,15 @@ use cif_train::{Control, Outcome, Stage, TrainConfig, TrainError, TrainEvent, Tr
 /// Steps of the fine stage behind which it is judged.
 const STEPS: [u32; 2] = [7, 14];
 
-/// Colours of their own: the field goes on in grey where that loses no more than so many dB.
+/// Colours of their own: the field goes on in black where that loses no more than so many dB.
 struct Colours {
     allowed_db: f64,
 }
 
 impl Colours {
-    fn in_grey(field: &Field) -> Field {
+    fn in_black(field: &Field) -> Field {
         let mut trial = field.clone();
-        trial.gaussians.sh_coefficients.iter_mut().for_each(|of| of[..3].fill(0.5));
+        trial.gaussians.sh_coefficients.iter_mut().for_each(|of| of[..3].fill(-3.0));
         trial
     }
 }
@@ -38,7 +38,7 @@ impl Effect for Colours {
     }
 
     fn judge(&self, bench: &mut Bench<'_>) -> Result<(), TrainError> {
-        let trial = Self::in_grey(bench.field());
+        let trial = Self::in_black(bench.field());
         let (with, without) = (bench.error(None)?, bench.error(Some(&trial))?);
         let gain_db = 10.0 * (without / with).log10();
         let kept = gain_db > self.allowed_db;
@@ -90,7 +90,7 @@ fn an_added_effect_is_judged_on_its_steps_and_taken_back_by_its_evidence() {
         judged.iter().map(|of| (of.0, of.1, of.3)).collect::<Vec<_>>(),
         [(Stage::Fine, STEPS[0], true), (Stage::Fine, STEPS[1], true)]
     );
-    assert!(judged.iter().all(|(.., gain_db, _)| *gain_db > 0.0), "flat grey is worse: {judged:?}");
+    assert!(judged.iter().all(|(.., gain_db, _)| *gain_db > 0.0), "black is worse: {judged:?}");
     // What is judged by trains nothing meanwhile, so that the run ends elsewhere.
     assert!(without_record(kept.field()) != without_record(without.field()));
     let seconds = kept.field().record.to_json()["train"]["seconds_by_effect"].clone();
@@ -99,8 +99,8 @@ fn an_added_effect_is_judged_on_its_steps_and_taken_back_by_its_evidence() {
     let mut taken = begun();
     let judged = run(&mut taken, Colours { allowed_db: 90.0 }, 10 + u64::from(STEPS[0]));
     assert!(!judged[0].3, "{judged:?}");
-    let is_grey = |field: &Field| field.gaussians.sh_coefficients.iter().all(|of| of[..3] == [0.5; 3]);
-    assert!(is_grey(taken.field()) && !is_grey(kept.field()));
+    let is_black = |field: &Field| field.gaussians.sh_coefficients.iter().all(|of| of[..3] == [-3.0; 3]);
+    assert!(is_black(taken.field()) && !is_black(kept.field()));
 }
 
 #[test]

@@ -170,7 +170,9 @@ fn resumed_from(dataset: &Dataset, state: Checkpoint) -> (Trainer, Vec<TrainEven
 fn fits_of_objects_are_stages_that_a_resumed_run_does_not_repeat() {
     let folder = tempfile::tempdir().unwrap();
     let dataset = rolling(folder.path());
-    let mut trainer = Trainer::new(Start::from(dataset.clone()), guided()).unwrap();
+    let mut config = guided();
+    config.report.checkpoint_seconds = 1;
+    let mut trainer = Trainer::new(dataset.clone(), config).unwrap();
     trainer.set_clock(Arc::new(Ticking::default()));
     let (mut states, mut seconds) = (Vec::new(), Vec::new());
     let outcome = trainer.run(&mut |event, view| {
