@@ -8,7 +8,7 @@ use glam::DVec2;
 
 use crate::Error;
 use crate::formats::{DraftCamera, DraftFocal};
-use crate::load::same_aspect;
+use crate::sizes::same_aspect;
 
 /// Deviation from orthonormal up to which a rotation is repaired; more is an error.
 pub(crate) const ROTATION_TOLERANCE: f64 = 1e-3;

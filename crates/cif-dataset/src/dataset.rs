@@ -8,27 +8,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::cryptomatte::ObjectIds;
-use crate::{CaptureFrame, FrameSource, Turn};
-
-/// The layouts that can be read.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Layout {
-    /// `dataset.json`, `metadata.json`, `scene.json`, `camera/`, `rgb/`.
-    HyperNerf,
-    /// `train_meta.json` and `test_meta.json` with a camera per image and time, `ims/`, `seg/`.
-    DynamicGaussians,
-    /// `poses_bounds.npy` with `camXX/images` or `camXX.mp4`.
-    Neu3d,
-    /// `poses_bounds.npy` with `images/`: the images of one moving camera in order.
-    Llff,
-    /// `transforms_train.json` and its siblings.
-    DNerf,
-    /// One `transforms.json`.
-    Nerfstudio,
-    /// `sparse/0` and `images/`.
-    Colmap,
-}
+use crate::{CaptureFrame, FrameSource, InstanceLabel, Layout, Turn};
 
 /// Split of a frame: trained on or held out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -97,21 +77,6 @@ pub struct Frame {
     pub mask: Option<PathBuf>,
     /// Confidence of the mask, where it has one: `confidence/<frame>.png` in the mask folder.
     pub confidence: Option<PathBuf>,
-}
-
-/// An instance named by the capture, or found only in its masks.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct InstanceLabel {
-    /// Value in the masks, 1 to 65 535.
-    pub id: u16,
-    /// Human name; `instance_12` when the capture names none.
-    pub label: String,
-    /// Class, where given; else equal to `label`.
-    pub category: String,
-    /// Names of its class in vocabularies of others by taxonomy, e.g. `wikidata_qcode` and `Q81727`; see
-    /// [`cif_output::check_taxonomy`].
-    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    pub taxonomies: BTreeMap<String, String>,
 }
 
 /// Training frames of one time from which on their cameras are a rig: a third view checks what two agree on.

@@ -11,8 +11,8 @@ use cif_geometry::PixelGrid;
 
 use crate::files::{mask, npy};
 use crate::lens_removal::undistort_mask;
-use crate::load::same_aspect;
 use crate::masks::files_of_frames;
+use crate::sizes::same_aspect;
 use crate::{Dataset, Error};
 
 /// Channels of a map.

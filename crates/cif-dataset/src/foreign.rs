@@ -5,9 +5,10 @@ use std::path::{Path, PathBuf};
 use cif_geometry::{LensDistortion, RigidTransform};
 use glam::DVec2;
 
+use crate::files::points::RawPoints;
 use crate::files::{listing, ply};
 use crate::formats::{DraftCamera, DraftFocal, colmap_cameras, colmap_model_in, transforms_cameras};
-use crate::points::{GREY, RawPoints};
+use crate::points::GREY;
 use crate::{Error, camera_check};
 
 /// Points: position and colour.

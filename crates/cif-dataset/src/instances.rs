@@ -3,10 +3,25 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path, PathBuf};
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
+use crate::Error;
 use crate::files::{json, listing};
-use crate::{Error, InstanceLabel};
+
+/// An instance named by the capture, or found only in its masks.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct InstanceLabel {
+    /// Value in the masks, 1 to 65 535.
+    pub id: u16,
+    /// Human name; `instance_12` when the capture names none.
+    pub label: String,
+    /// Class, where given; else equal to `label`.
+    pub category: String,
+    /// Names of its class in vocabularies of others by taxonomy, e.g. `wikidata_qcode` and `Q81727`; see
+    /// [`cif_output::check_taxonomy`].
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub taxonomies: BTreeMap<String, String>,
+}
 
 #[derive(Deserialize)]
 #[serde(untagged)]

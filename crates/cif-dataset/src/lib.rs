@@ -54,19 +54,22 @@ mod open;
 pub mod orientation;
 mod placement;
 mod points;
+mod recognition;
+mod sizes;
 mod summary;
 
 /// Where a dataset lies in the coordinates of its capture.
 pub use cif_geometry::CaptureFrame;
 pub use dataset::{
-    DEFAULT_VIDEO_FRAMES, Dataset, Frame, FrameData, InstanceLabel, Layout, OpenOptions, PointCloud,
-    PointSource, Split,
+    DEFAULT_VIDEO_FRAMES, Dataset, Frame, FrameData, OpenOptions, PointCloud, PointSource, Split,
 };
 pub use error::Error;
 pub use feature_maps::feature_maps;
 pub use frame_source::{FrameSource, VideoFrame};
-pub use load::same_aspect;
+pub use instances::InstanceLabel;
+pub use layout::Layout;
 pub use made_from::MadeFrom;
 pub use motion_truth::{MotionTruth, TrueMotion};
 pub use orientation::Turn;
+pub use sizes::same_aspect;
 pub use summary::{CameraSummary, CaptureSummary, InstanceSummary, MaskSummary};

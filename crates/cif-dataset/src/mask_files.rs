@@ -8,8 +8,8 @@ use rayon::prelude::*;
 
 use crate::cryptomatte::{self, ObjectIds};
 use crate::files::{confidence, listing, mask};
-use crate::load::same_aspect;
-use crate::masks::files_of_video;
+use crate::masks::{CONFIDENCE_FOLDER, files_of_video};
+use crate::sizes::same_aspect;
 use crate::{Error, Frame, Layout, Split};
 
 /// Mask folder that is taken where none is asked for.
@@ -44,9 +44,6 @@ impl MaskFolder {
         Self { name: name.into(), path: root.join(name) }
     }
 }
-
-/// Folder of confidences inside a mask folder.
-pub(crate) const CONFIDENCE_FOLDER: &str = "confidence";
 
 /// Endings of mask files, first choice first.
 const EXTENSIONS: [&str; 2] = ["png", "exr"];

@@ -6,14 +6,15 @@ use std::path::{Path, PathBuf};
 use cif_geometry::PinholeCamera;
 use rayon::prelude::*;
 
+use crate::files::points::RawPoints;
 use crate::files::{image, json, listing};
 use crate::formats::{self, Draft, Source, some_of};
-use crate::load::{centred, reduced_size};
 use crate::mask_files::MaskFolder;
 use crate::orientation::Orientation;
+use crate::sizes::{centred, reduced_size};
 use crate::{
     CaptureFrame, Dataset, Error, Frame, Layout, OpenOptions, PointCloud, PointSource, Split, Turn,
-    camera_check, cryptomatte, instances, layout, mask_files, placement, points,
+    camera_check, cryptomatte, instances, mask_files, placement, points, recognition,
 };
 
 impl OpenOptions {
@@ -22,7 +23,7 @@ impl OpenOptions {
     /// # Errors
     /// When the folder is missing, nothing fits, two layouts fit, or the one of the options does not.
     pub fn layout_of(&self, root: impl AsRef<Path>) -> Result<Layout, Error> {
-        layout::recognise(root.as_ref(), self.layout, &mut Vec::new())
+        recognition::recognise(root.as_ref(), self.layout, &mut Vec::new())
     }
 }
 
@@ -40,7 +41,7 @@ impl Dataset {
         if options.downscale == Some(0) {
             return Err(Error::invalid(root, "images cannot be reduced by 0; give 1, 2, 4, ..."));
         }
-        let layout = layout::recognise(root, options.layout, &mut notes)?;
+        let layout = recognition::recognise(root, options.layout, &mut notes)?;
         let mut draft = formats::read(layout, &Source { root, options })?;
         draft.leave_out(root, &options.without_cameras)?;
         warnings.extend(draft.warnings.iter().cloned());
@@ -398,7 +399,7 @@ impl Dataset {
     /// and points enter the frame of the dataset.
     fn initial_points(
         &mut self,
-        file: Option<(points::RawPoints, PathBuf)>,
+        file: Option<(RawPoints, PathBuf)>,
         random_box: Option<f64>,
     ) -> Result<PointCloud, Error> {
         let (mut positions, colors, source) = match self.measured_points(file) {
@@ -419,10 +420,7 @@ impl Dataset {
     }
 
     /// The points of a file, where there are any and they were measured.
-    fn measured_points(
-        &mut self,
-        file: Option<(points::RawPoints, PathBuf)>,
-    ) -> Option<(points::RawPoints, PathBuf)> {
+    fn measured_points(&mut self, file: Option<(RawPoints, PathBuf)>) -> Option<(RawPoints, PathBuf)> {
         let (mut raw, path) = file?;
         let place = path.display();
         let dropped = raw.retain_finite();

@@ -6,7 +6,7 @@ use cif_geometry::PixelGrid;
 use glam::DVec2;
 pub use image::metadata::Orientation;
 
-use crate::load::same_aspect;
+use crate::sizes::same_aspect;
 
 /// How the pixels of files are turned into those of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -150,6 +150,14 @@ impl Field {
         }
     }
 
+    /// Gives the field another table of instances, which no Gaussian and no track group is known to be of.
+    pub fn replace_instances(&mut self, instances: Vec<Instance>) {
+        self.instances = instances;
+        self.identities = None;
+        let groups = self.tracks.iter_mut().flat_map(|tracks| &mut tracks.groups);
+        groups.for_each(|group| group.instance = None);
+    }
+
     /// Position in [`Field::instances`] of the instance with a mask value.
     #[must_use]
     pub fn instance_by_id(&self, id: u16) -> Option<usize> {

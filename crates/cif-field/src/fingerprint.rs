@@ -34,6 +34,9 @@ impl Field {
         if let Some(tracks) = &self.tracks {
             hash.array(&tracks.group_of);
             for group in &tracks.groups {
+                if let Some(id) = group.instance {
+                    hash.array(&[id]);
+                }
                 hash.array(&[u8::from(group.deformed)]);
                 hash.array(&group.pivot.to_array());
                 for pose in &group.poses {
@@ -116,13 +119,14 @@ mod tests {
     #[test]
     fn every_part_that_a_scene_is_made_from_counts() {
         type Change = fn(&mut Field);
-        let changes: [Change; 14] = [
+        let changes: [Change; 15] = [
             |field| field.gaussians.means[3][1] = field.gaussians.means[3][1].next_up(),
             |field| field.gaussians.sh_coefficients[0][47] += 0.25,
             |field| field.gaussians.means.swap(0, 1),
             |field| field.deformation = None,
             |field| field.deformation.as_mut().unwrap().planes[0] += 0.5,
             |field| field.tracks = None,
+            |field| field.tracks.as_mut().unwrap().groups[1].instance = Some(field.instances[0].id),
             |field| field.tracks.as_mut().unwrap().groups[0].poses[0].translation.x += 1e-9,
             |field| field.tracks.as_mut().unwrap().groups[1].visibility[0].visible ^= true,
             |field| field.tracks.as_mut().unwrap().groups[0].opacities.as_mut().unwrap().values[0] = 0.25,

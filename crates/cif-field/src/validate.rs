@@ -135,6 +135,7 @@ impl Field {
         if let Some(identities) = &self.identities {
             identities.validate(self.gaussians.len(), self.instances.len())?;
         }
+        self.validate_group_instances()?;
         self.timeline.validate()?;
         for (index, camera) in self.cameras.iter().enumerate() {
             validate_camera(camera, self.timeline.times.len()).map_err(|problem| FieldError::Camera {
@@ -152,6 +153,42 @@ impl Field {
         }
         if !(self.extent.is_finite() && self.extent >= 0.0) {
             return value("extent", self.extent.to_string(), "a finite length in metres");
+        }
+        Ok(())
+    }
+
+    /// Checks what [`TrackGroup::instance`] promises.
+    fn validate_group_instances(&self) -> Result<(), FieldError> {
+        let Some(tracks) = &self.tracks else { return Ok(()) };
+        let broken = |index: usize, problem: String| {
+            Err(FieldError::Track { index, name: tracks.groups[index].name.clone(), problem })
+        };
+        let mut instance_of = Vec::with_capacity(tracks.groups.len());
+        for (index, group) in tracks.groups.iter().enumerate() {
+            let known = group.instance.map(|id| (id, self.instance_by_id(id)));
+            if let Some((id, None)) = known {
+                return broken(
+                    index,
+                    format!("is of the instance id {id}, which is not in the instance table"),
+                );
+            }
+            let base = group.joint.map(|joint| tracks.groups[joint.base as usize].instance);
+            if base.is_some_and(|base| base != group.instance) {
+                return broken(index, "has a joint on a group of another instance".to_owned());
+            }
+            instance_of.push(known.and_then(|(_, instance)| instance));
+        }
+        let Some(identities) = &self.identities else { return Ok(()) };
+        for row in 0..self.gaussians.len() {
+            let Some((group, own)) = tracks.group(row).and_then(|group| Some((group, instance_of[group]?)))
+            else {
+                continue;
+            };
+            let owner = identities.owner(row);
+            if owner != Owner::Estimated && owner != Owner::Instance(own as u16) {
+                let id = self.instances[own].id;
+                return broken(group, format!("is of the instance id {id}, but its Gaussian {row} is not"));
+            }
         }
         Ok(())
     }

@@ -10,7 +10,7 @@
 //! | [`from_field::assignment`] | which node a Gaussian belongs to |
 //! | [`from_field::camera_tracks`] | recorded cameras as tracks over time |
 //! | [`to_field`] | a graph as a field: Gaussians, recorded motion and instances |
-//! | [`motion`] | how well standing still and one rigid body fit a group of Gaussians |
+//! | [`motion`] | how a node moves: by recorded poses, or by how well standing still and one rigid body fit its Gaussians |
 //! | [`motion::parts`] | a few rigid parts, found by clustering the paths of Gaussians |
 //! | [`motion::keys`] | fewer samples of a track inside an error bound |
 //! | [`motion::velocity`] | how fast a node moves |
@@ -35,8 +35,9 @@
 //! | [`assemble`](mod@assemble) | graphs from what readers find in files |
 //!
 //! Frames: world as captured (right-handed, metres), or a frame of the scene's own in it (see [`world`]). A node's
-//! splats live in its local frame, whose axes are the world's and whose origin is the node's pivot at the reference
-//! time, so that no rotation is baked into splats and their spherical harmonics are stored as trained.
+//! splats live in its local frame, so that no rotation is baked into splats and their spherical harmonics are stored as
+//! trained. The origin of the frame is the node's pivot at the reference time; its axes are those in which the field
+//! stores the Gaussians where poses are recorded, else those of the world at the reference time.
 
 pub mod appearance;
 pub mod assemble;
@@ -49,7 +50,6 @@ pub mod files;
 pub mod format;
 pub mod from_field;
 pub mod graph;
-pub(crate) mod joint;
 pub mod motion;
 pub mod motion_scores;
 pub mod naming;

@@ -63,7 +63,8 @@ pub(crate) fn recorded_field(objects: usize, seed: u64) -> Field {
             continue;
         }
         tracks.group_of.extend([tracks.groups.len() as u32; MEMBERS]);
-        tracks.groups.push(group(object, centre, &gaussians, first, &mut numbers));
+        let instance = Some(3 * object as u16 + 2);
+        tracks.groups.push(TrackGroup { instance, ..group(object, centre, &gaussians, first, &mut numbers) });
     }
     Field {
         gaussians,

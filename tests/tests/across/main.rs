@@ -17,6 +17,7 @@ mod hard_cases;
 mod module_tangles;
 mod objects;
 mod outputs;
+mod recorded_motion;
 mod reference;
 mod render_memory;
 mod unfinished_capture;

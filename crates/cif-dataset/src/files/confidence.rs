@@ -7,8 +7,8 @@ use png::{BitDepth, ColorType};
 
 use super::mask;
 use crate::Error;
-use crate::load::same_aspect;
 use crate::orientation::Turn;
+use crate::sizes::same_aspect;
 
 /// Checks the header of a confidence against the size of its image.
 ///

@@ -8,6 +8,7 @@ pub(crate) mod listing;
 pub(crate) mod mask;
 pub(crate) mod npy;
 pub(crate) mod ply;
+pub(crate) mod points;
 pub(crate) mod video;
 
 /// No PNG holds more than this per byte, as DEFLATE cannot pack more: a header that claims more is not believed.

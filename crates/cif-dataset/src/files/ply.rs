@@ -8,7 +8,7 @@ use ply_rs_bw::ply::{
     ElementDef, Encoding, Property, PropertyAccess, PropertyAccessResult, PropertyType, ScalarType,
 };
 
-use super::super::points::{RawPoints, by_range};
+use super::points::{RawPoints, by_range};
 use crate::Error;
 
 #[derive(Clone, Copy)]

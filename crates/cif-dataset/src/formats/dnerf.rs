@@ -5,7 +5,8 @@
 
 use std::path::Path;
 
-use super::{Draft, DraftFrame, Source, customary_points, transforms};
+use super::draft::{Draft, DraftFrame, Source, customary_points};
+use super::transforms;
 use crate::files::listing;
 use crate::{Error, Split};
 

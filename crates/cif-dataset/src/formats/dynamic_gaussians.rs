@@ -11,10 +11,11 @@ use cif_geometry::{LensDistortion, RigidTransform};
 use glam::{DMat3, DVec2, DVec3};
 use serde::Deserialize;
 
-use super::{Draft, DraftCamera, DraftFocal, DraftFrame, Source, customary_points, transforms};
+use super::draft::{Draft, DraftCamera, DraftFocal, DraftFrame, Source, customary_points};
+use super::transforms;
 use crate::files::npy::{Archive, Elements};
+use crate::files::points::{RawPoints, by_range};
 use crate::files::{json, listing};
-use crate::points::{RawPoints, by_range};
 use crate::{Error, Split};
 
 /// A file of cameras: `[times][images]`.

@@ -11,7 +11,8 @@ use cif_geometry::LensDistortion;
 use glam::{DMat3, DVec2, DVec3};
 use serde::Deserialize;
 
-use super::{Draft, DraftCamera, DraftFocal, DraftFrame, Source, colmap, some_of, world_to_camera};
+use super::colmap;
+use super::draft::{Draft, DraftCamera, DraftFocal, DraftFrame, Source, some_of, world_to_camera};
 use crate::files::{json, listing};
 use crate::{Error, Split};
 

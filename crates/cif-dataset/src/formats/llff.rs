@@ -10,7 +10,8 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{Draft, DraftCamera, DraftFrame, Source, colmap, poses_bounds, some_of};
+use super::draft::{Draft, DraftCamera, DraftFrame, Source, some_of};
+use super::{colmap, poses_bounds};
 use crate::files::{image, listing};
 use crate::{Error, Split};
 

@@ -6,8 +6,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use super::draft::{Draft, DraftFrame, Source, customary_points, hold_out_every_eighth, some_of};
 use super::transforms::{self, TransformsFile, World};
-use super::{Draft, DraftFrame, Source, customary_points, hold_out_every_eighth, some_of};
 use crate::files::{listing, ply};
 use crate::{Error, Split};
 

@@ -5,11 +5,12 @@ use std::path::{Path, PathBuf};
 
 use glam::DVec2;
 
-use super::{Draft, DraftCamera, DraftFrame, Source, customary_points, poses_bounds, some_of};
+use super::draft::{Draft, DraftCamera, DraftFrame, Source, customary_points, some_of};
+use super::poses_bounds;
 use crate::dataset::DEFAULT_VIDEO_FRAMES;
 use crate::files::listing;
 use crate::files::video::{self, Extraction};
-use crate::load::reduced_size;
+use crate::sizes::reduced_size;
 use crate::{Error, Split};
 
 /// One camera of the rig with its images in order.

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use cif_geometry::LensDistortion;
 use glam::{DMat3, DVec2, DVec3};
 
-use super::{DraftCamera, DraftFocal, world_to_camera};
+use super::draft::{DraftCamera, DraftFocal, world_to_camera};
 use crate::files::{image, npy};
 use crate::{Error, Turn};
 

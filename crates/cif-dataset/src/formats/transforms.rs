@@ -6,7 +6,7 @@ use cif_geometry::LensDistortion;
 use glam::DVec2;
 use serde::Deserialize;
 
-use super::{DraftCamera, DraftFocal, from_opengl};
+use super::draft::{DraftCamera, DraftFocal, from_opengl};
 use crate::files::{json, listing};
 use crate::{Error, FrameSource};
 

@@ -7,7 +7,7 @@ use cif_geometry::PixelGrid;
 
 use crate::files::{listing, mask};
 use crate::lens_removal::undistort_mask;
-use crate::load::same_aspect;
+use crate::sizes::same_aspect;
 use crate::{Dataset, Error};
 
 /// Name of a frame as a single file name: `cam03/0007` is `cam03_0007`.

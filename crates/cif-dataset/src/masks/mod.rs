@@ -21,6 +21,7 @@ pub(crate) use numbered::number_of;
 pub use numbered::{files_of_video, first_number, numbered_files};
 pub use split::{KeptInstance, RemovedInstance, SplitReport, split_tracker_masks};
 pub use view_order::{ViewOrder, ordered_views};
+pub(crate) use writer::CONFIDENCE_FOLDER;
 pub use writer::MaskWriter;
 pub use zigzag::{INDEX_FILE, ZigzagEntry, ZigzagIndex, frame_of, position_of, write_zigzag, zigzag_order};
 
@@ -44,7 +45,7 @@ pub fn read_ids_at(
     turn: crate::Turn,
 ) -> Result<cif_geometry::PixelGrid<u16>, crate::Error> {
     let ids = turn.seen(crate::files::mask::decode(path)?, size);
-    if !crate::load::same_aspect((ids.width, ids.height), size) {
+    if !crate::sizes::same_aspect((ids.width, ids.height), size) {
         return Err(crate::Error::MaskSize {
             mask: path.to_owned(),
             mask_size: (ids.width, ids.height),

@@ -6,8 +6,10 @@ use cif_geometry::PixelGrid;
 
 use super::folder::NewFolder;
 use crate::files::{json, mask};
-use crate::mask_files::CONFIDENCE_FOLDER;
 use crate::{Error, InstanceLabel};
+
+/// Folder of confidences inside a mask folder.
+pub(crate) const CONFIDENCE_FOLDER: &str = "confidence";
 
 /// A new folder of masks: `<frame>.png` with the ids of a frame, `confidence/<frame>.png` with the probability that each
 /// is right in units of 1 / 255, and `instances.json`. It appears when it is finished, whole.

@@ -12,7 +12,7 @@
 //! A surface leaves cells empty from four cells along each side on, and cells need points: clouds of fewer than 512 are
 //! taken as measured.
 
-use super::RawPoints;
+use crate::files::points::RawPoints;
 
 /// Points looked at, spread evenly over the cloud; more add nothing.
 const MOST: usize = 20_000;

@@ -6,18 +6,16 @@ mod random;
 mod sight;
 
 use std::collections::HashMap;
-use std::path::Path;
 
 use cif_geometry::Bounds;
 use glam::DVec3;
 
-pub(crate) use color::{by_range, sample_colors};
+pub(crate) use color::sample_colors;
 pub(crate) use made_up::are_made_up;
 pub(crate) use random::draw;
 pub(crate) use sight::unseen_warning;
 
-use crate::files::npy;
-use crate::{Error, PointCloud};
+use crate::PointCloud;
 
 /// First voxel edges of the thinning between points that lie evenly on a surface.
 const VOXELS_PER_POINT: f64 = 8.0;
@@ -30,52 +28,6 @@ const SMALLEST_VOXEL: f64 = 1e-9;
 
 /// Colour of points whose source has none and that no image shows.
 pub(crate) const GREY: [u8; 3] = [128; 3];
-
-/// Points of a file.
-pub(crate) struct RawPoints {
-    /// In double precision: worlds of surveyors begin so far away that floats are half a metre apart.
-    pub(crate) positions: Vec<[f64; 3]>,
-    pub(crate) colors: Option<Vec<[u8; 3]>>,
-    /// How numbers of an unusual type were taken as colours.
-    pub(crate) note: Option<String>,
-}
-
-/// Reads `points.npy`: `[P, 3]` world positions.
-///
-/// # Errors
-/// When the file is not an array of that shape.
-pub(crate) fn read_npy(path: &Path) -> Result<RawPoints, Error> {
-    let matrix = npy::read_matrix(path)?;
-    if matrix.columns != 3 {
-        return Err(Error::invalid(
-            path,
-            format!("shape [{}, {}] where [points, 3] is expected", matrix.rows, matrix.columns),
-        ));
-    }
-    Ok(RawPoints {
-        positions: matrix.values.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect(),
-        colors: None,
-        note: None,
-    })
-}
-
-impl RawPoints {
-    /// Drops points that are not finite in single precision, and says how many.
-    pub(crate) fn retain_finite(&mut self) -> usize {
-        let keep: Vec<bool> =
-            self.positions.iter().map(|p| p.iter().all(|v| (*v as f32).is_finite())).collect();
-        let dropped = keep.iter().filter(|keep| !**keep).count();
-        if dropped > 0 {
-            let mut flags = keep.iter();
-            self.positions.retain(|_| *flags.next().expect("one flag per point"));
-            if let Some(colors) = &mut self.colors {
-                let mut flags = keep.iter();
-                colors.retain(|_| *flags.next().expect("one flag per point"));
-            }
-        }
-        dropped
-    }
-}
 
 /// Side of a cloud's box, in sides of the box of its middle half, from which the points far outside are outliers.
 /// A uniform cube has 2, a normal distribution of a million points about 7.
@@ -240,17 +192,5 @@ mod tests {
     #[test]
     fn coincident_points_become_one() {
         assert_eq!(line(50, 0.0).thinned(1).positions.len(), 1);
-    }
-
-    #[test]
-    fn non_finite_points_are_dropped_with_their_colors() {
-        let mut points = RawPoints {
-            positions: vec![[0.0; 3], [f64::NAN, 0.0, 0.0], [2.0; 3]],
-            colors: Some(vec![[1; 3], [2; 3], [3; 3]]),
-            note: None,
-        };
-        assert_eq!(points.retain_finite(), 1);
-        assert_eq!(points.positions, vec![[0.0; 3], [2.0; 3]]);
-        assert_eq!(points.colors, Some(vec![[1; 3], [3; 3]]));
     }
 }

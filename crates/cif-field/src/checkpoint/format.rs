@@ -17,9 +17,12 @@ use crate::{DeformationConfig, Field, Instance, RecordedCamera, SortMetric, Time
 /// ([`crate::Deformation::still`]); 4 adds recorded opacities and colours ([`crate::TrackGroup::opacities`]), and
 /// identity rows without entries or with an owner ([`crate::Owner`]); 5 adds evidence for rotations
 /// ([`crate::TrackGroup::rotation`]); 6 adds joints ([`crate::TrackGroup::joint`]); 7 adds heads
-/// ([`super::Checkpoint::head`]); 8 adds taxonomies ([`Instance::taxonomies`]). A scene without these is written as 1 to
-/// 7, so that older software reads it.
-pub const FORMAT: u32 = 8;
+/// ([`super::Checkpoint::head`]); 8 adds taxonomies ([`Instance::taxonomies`]); 9 adds instances of track
+/// groups ([`crate::TrackGroup::instance`]). A scene without these is written as 1 to 8, so that older software reads it.
+pub const FORMAT: u32 = 9;
+
+/// The layout before instances of track groups.
+const FORMAT_WITH_TAXONOMIES: u32 = 8;
 
 /// The layout before taxonomies.
 const FORMAT_WITH_HEADS: u32 = 7;
@@ -44,8 +47,10 @@ const FORMAT_WITHOUT_TRACKS: u32 = 1;
 
 /// Oldest layout that holds a field, and what a head learnt where `has_head`.
 pub(super) fn format_of(field: &Field, has_head: bool) -> u32 {
-    if field.instances.iter().any(|instance| !instance.taxonomies.is_empty()) {
+    if groups(field).any(|group| group.instance.is_some()) {
         FORMAT
+    } else if field.instances.iter().any(|instance| !instance.taxonomies.is_empty()) {
+        FORMAT_WITH_TAXONOMIES
     } else if has_head {
         FORMAT_WITH_HEADS
     } else if groups(field).any(|group| group.joint.is_some()) {
@@ -162,6 +167,8 @@ pub(super) struct DeformationJson {
 #[serde(deny_unknown_fields)]
 pub(super) struct TrackGroupJson {
     name: String,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    instance: Option<u16>,
     deformed: bool,
     pivot: [f64; 3],
     /// Rows of the poses' tensor; those of the groups follow one another.
@@ -223,6 +230,7 @@ impl TrackGroupJson {
     fn of(group: &TrackGroup) -> Self {
         Self {
             name: group.name.clone(),
+            instance: group.instance,
             deformed: group.deformed,
             pivot: group.pivot.to_array(),
             poses: group.poses.len(),
@@ -248,6 +256,7 @@ impl TrackGroupJson {
         };
         TrackGroup {
             name: self.name,
+            instance: self.instance,
             deformed: self.deformed,
             pivot: DVec3::from_array(self.pivot),
             poses: arrays.poses.into_iter().map(pose).collect(),

@@ -343,6 +343,54 @@ fn joints_survive_raise_the_format_and_are_checked() {
 }
 
 #[test]
+fn instances_of_groups_survive_raise_the_format_and_are_checked() {
+    let mut named = Checkpoint { field: testing::tracked_field(20, 4), training: None, head: None };
+    let unnamed = named.field.fingerprint();
+    let id = named.field.instances[1].id;
+    named.field.tracks.as_mut().unwrap().groups[2].instance = Some(id);
+    assert_ne!(named.field.fingerprint(), unnamed);
+    let bytes = bytes_of(&named);
+    let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).unwrap();
+    assert_eq!(header.metadata().clone().unwrap()["cif.format"], FORMAT.to_string());
+    let loaded = read_bytes(&bytes).unwrap();
+    assert_eq!(loaded, named);
+    let groups = |field: &Field| field.tracks.clone().unwrap().groups;
+    assert_eq!(groups(&loaded.field.gather(&[2, 2, 1]))[1].instance, Some(id), "groups take it along");
+    let problem = |change: &dyn Fn(&mut Field)| {
+        let mut field = named.field.clone();
+        change(&mut field);
+        field.validate().unwrap_err().to_string()
+    };
+    let unknown = problem(&|field| field.tracks.as_mut().unwrap().groups[2].instance = Some(999));
+    assert_eq!(
+        unknown,
+        "track group 2 (\"added\") is of the instance id 999, which is not in the instance table"
+    );
+    let joint = Joint { base: 0, kind: JointKind::Revolute, axis: DVec3::X };
+    let apart = problem(&|field| field.tracks.as_mut().unwrap().groups[2].joint = Some(joint));
+    assert!(apart.contains("has a joint on a group of another instance"), "{apart}");
+    let row = named.field.tracks.as_ref().unwrap().group_of.iter().position(|group| *group == 2).unwrap();
+    let owned = |owner| {
+        move |field: &mut Field| {
+            let owners = &mut field.identities.as_mut().unwrap().owners;
+            owners.resize(20, Owner::Estimated);
+            owners[row] = owner;
+        }
+    };
+    for owner in [Owner::Background, Owner::Instance(0)] {
+        let told = problem(&owned(owner));
+        assert!(told.contains(&format!("but its Gaussian {row} is not")), "{told}");
+    }
+    let mut field = named.field.clone();
+    owned(Owner::Instance(1))(&mut field);
+    field.validate().unwrap();
+    // Another table of instances knows nothing of the old ones.
+    field.replace_instances(Vec::new());
+    field.validate().unwrap();
+    assert!(field.identities.is_none() && groups(&field).iter().all(|group| group.instance.is_none()));
+}
+
+#[test]
 fn what_stands_still_survives_and_raises_the_format() {
     let format = |bytes: &[u8]| {
         let (_, header) = safetensors::SafeTensors::read_metadata(bytes).unwrap();
@@ -661,7 +709,7 @@ fn heads_and_taxonomies_survive_and_raise_the_format() {
     let mut named = finished.clone();
     named.field.instances[1].taxonomies = [("coco".to_owned(), "cup".to_owned())].into();
     let with_taxonomies = bytes_of(&named);
-    assert_eq!(format_of(&with_taxonomies), FORMAT.to_string());
+    assert_eq!(format_of(&with_taxonomies), "8");
     assert_eq!(read_bytes(&with_taxonomies).unwrap(), named);
     assert_ne!(named.field.fingerprint(), finished.field.fingerprint());
     named.field.instances[1].taxonomies = [("a-b".to_owned(), "cup".to_owned())].into();

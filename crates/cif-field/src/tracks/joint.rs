@@ -106,7 +106,8 @@ impl Tracks {
 }
 
 impl TrackGroup {
-    /// A part that moves on another group by a joint through `pivot`; `values` by strictly ascending time.
+    /// A part that moves on another group, of the same instance, by a joint through `pivot`; `values` by strictly
+    /// ascending time.
     ///
     /// # Panics
     /// When the base is none of `groups`.
@@ -129,7 +130,8 @@ impl TrackGroup {
                 poses[k].rotation = -poses[k].rotation;
             }
         }
-        Self { deformed: false, poses, joint: Some(joint), ..Self::still(name, pivot) }
+        let still = Self::still(name, pivot);
+        Self { instance: base.instance, deformed: false, poses, joint: Some(joint), ..still }
     }
 }
 

@@ -21,6 +21,7 @@ use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::gaussians::SH_FLOATS;
+use crate::instance::Instance;
 
 pub use apply::{DenseAtTime, GroupAtTime, HIDDEN_LOGIT, SamplesAtTime, TracksAtTime};
 pub use joint::{Joint, JointKind};
@@ -42,6 +43,17 @@ pub struct Tracks {
 pub struct TrackGroup {
     /// Name of the object, for people.
     pub name: String,
+    /// Id ([`crate::Instance::id`]) of the instance that the group is of; `None` for the background, and where nobody
+    /// told (files before format 9). With an id
+    ///
+    /// - every Gaussian of the group is the instance's, whatever its identity row says; an [`crate::Owner`] that a row has
+    ///   is the same instance,
+    /// - where the learned deformation leaves the group alone, its groups are all of the instance: Gaussians elsewhere
+    ///   whose rows estimate the instance do not move with it (shadows, and what else its masks show), and are background,
+    /// - the group that a joint is on is of the same instance.
+    ///
+    /// The first and the last are rules of [`crate::Field::validate`].
+    pub instance: Option<u16>,
     /// True when the learned deformation moves the group before its track does; off for what was added to a
     /// trained scene.
     pub deformed: bool,
@@ -178,6 +190,7 @@ impl TrackGroup {
     pub fn still(name: impl Into<String>, pivot: DVec3) -> Self {
         Self {
             name: name.into(),
+            instance: None,
             deformed: true,
             pivot,
             poses: Vec::new(),
@@ -190,10 +203,17 @@ impl TrackGroup {
         }
     }
 
+    /// A group of an instance, still so far, that the learned deformation leaves alone.
+    #[must_use]
+    pub fn of_instance(instance: &Instance, pivot: DVec3) -> Self {
+        Self { instance: Some(instance.id), deformed: false, ..Self::still(&instance.label, pivot) }
+    }
+
     /// The same motion for members `members[0], members[1], ...` of the group, which may repeat.
     fn gather(&self, members: &[usize]) -> Self {
         Self {
             name: self.name.clone(),
+            instance: self.instance,
             deformed: self.deformed,
             pivot: self.pivot,
             poses: self.poses.clone(),

@@ -105,7 +105,8 @@ class SceneOptions(TypedDict, total=False):
     """Options of an exported scene, whatever the format."""
 
     tolerance: str | float
-    """Largest error of a simplified motion: "0.2%" of the size of the object (the default), or world units."""
+    """Largest error of a motion that is fitted, where no poses are recorded: "0.2%" of the size of the object (the
+    default), or world units."""
     appearance_tolerance: float
     """Largest RMS error of opacities and colours that change over time; 0 keeps them at every frame."""
     most_expensive_motion: Literal["static", "rigid", "parts", "dense"]
@@ -118,7 +119,8 @@ class SceneOptions(TypedDict, total=False):
     max_parts: int
     """Most rigid parts of an object."""
     reduce_keys: bool
-    """Leave out samples that interpolation reproduces inside the tolerance; on by default."""
+    """Leave out samples that interpolation reproduces: inside the tolerance, or up to rounding where poses are recorded.
+    On by default."""
     hulls_per_instance: int
     """Most convex colliders of an object; by default 1."""
     background_hulls: int

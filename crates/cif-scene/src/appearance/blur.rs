@@ -10,7 +10,7 @@ use cif_geometry::{RigidTransform, quaternion};
 use cif_render::constants::LOW_PASS;
 use glam::{DMat3, DVec2, DVec3};
 
-use crate::graph::{CameraSample, CameraTrack, Motion, Node};
+use crate::graph::{CameraSample, CameraTrack, Motion, Node, Part};
 use crate::shape::extent;
 
 /// Views at most that sizes of pixels are taken from, spread over all recorded ones.
@@ -138,10 +138,7 @@ fn bounds(node: &mut Node) {
         }
         Motion::Static | Motion::Rigid(_) => {}
     }
-    node.extent = extent::node_bounds(at_rest, &node.splats, &node.motion, |part| RigidTransform {
-        translation: part.pivot,
-        ..RigidTransform::IDENTITY
-    });
+    node.extent = extent::node_bounds(at_rest, &node.splats, &node.motion, Part::at_first);
 }
 
 #[cfg(test)]

@@ -29,13 +29,13 @@ pub struct Opacities {
 }
 
 impl Opacities {
-    /// Looks at all sampled times, if anything moves.
+    /// Looks at all sampled times, if opacities can change.
     #[must_use]
     pub fn of(frames: &mut Frames<'_>) -> Self {
         let first = frames.at(0);
         let mut peak = first.opacity_logits.clone();
         let mut change = false;
-        if frames.moves() {
+        if frames.fade() {
             for step in 1..frames.len() {
                 let frame = frames.at(step);
                 if frame.opacity_logits != first.opacity_logits {

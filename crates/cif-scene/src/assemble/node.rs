@@ -9,8 +9,8 @@ use crate::graph::MotionReport;
 use crate::graph::{
     Appearance, AppearanceSample, DenseMotion, DenseSample, Motion, Node, NodeKind, Part, PartsMotion, Splats,
 };
+use crate::naming;
 use crate::shape::extent;
-use crate::{PoseSample, naming};
 
 /// The node; its frames are still to be told.
 pub(super) fn node(mut prim: Prim, kind: NodeKind, name: String) -> Node {
@@ -28,10 +28,6 @@ pub(super) fn node(mut prim: Prim, kind: NodeKind, name: String) -> Node {
         (if poses.is_empty() { Motion::Static } else { Motion::Rigid(poses) }, splats)
     };
     let report = prim.report.filter(|report| report.model == motion.model());
-    let at_first = |part: &Part| {
-        let rest = RigidTransform { translation: part.pivot, ..RigidTransform::IDENTITY };
-        part.track.first().map_or(rest, PoseSample::transform)
-    };
     Node {
         kind,
         name,
@@ -40,7 +36,7 @@ pub(super) fn node(mut prim: Prim, kind: NodeKind, name: String) -> Node {
         taxonomies: prim.taxonomies,
         embedding: prim.embedding,
         pivot,
-        extent: extent::node_bounds(&RigidTransform::IDENTITY, &splats, &motion, at_first),
+        extent: extent::node_bounds(&RigidTransform::IDENTITY, &splats, &motion, Part::at_first),
         mean_occupancy: prim.mean_occupancy.unwrap_or_else(|| splats.mean_occupancy()),
         report: report.unwrap_or_else(|| MotionReport::unfitted(&splats, &motion)),
         motion,

@@ -1,6 +1,8 @@
 //! Instance table and identity rows of an edited field.
 
-use cif_field::{Identities, Instance};
+use std::collections::BTreeMap;
+
+use cif_field::{Field, Identities, Instance};
 
 use super::plan::{Plan, instance_of};
 
@@ -58,6 +60,22 @@ pub(super) fn rebuild(
         }
     }
     (instances, Some(identities))
+}
+
+/// Keeps what groups say of their instances ([`cif_field::TrackGroup::instance`]): rows with an owner have theirs, and a
+/// group whose instance was removed names none.
+pub(super) fn follow_groups(field: &mut Field) {
+    let Some(tracks) = &mut field.tracks else { return };
+    let index_of: BTreeMap<u16, u16> =
+        field.instances.iter().zip(0..).map(|(instance, index)| (instance.id, index)).collect();
+    for group in &mut tracks.groups {
+        group.instance = group.instance.filter(|id| index_of.contains_key(id));
+    }
+    let owners = field.identities.iter_mut().flat_map(|identities| &mut identities.owners);
+    for (row, owner) in owners.enumerate().filter(|(_, owner)| **owner != cif_field::Owner::Estimated) {
+        let id = tracks.group(row).and_then(|group| tracks.groups[group].instance);
+        *owner = id.map_or(*owner, |id| cif_field::Owner::Instance(index_of[&id]));
+    }
 }
 
 /// A row without the entries of removed instances. A row that belongs to one that stays keeps its labelled

@@ -234,9 +234,16 @@ impl Work {
             (true, NodeKind::Background, _) => None,
             (false, _, index) => index.map(|index| index as u16),
         };
+        let id = owner.map(|index| self.instances.entries[usize::from(index)].id);
         if step.pair.duplicate {
-            let copies = step.first_copy as usize..step.first_copy as usize + step.splats.kept.len();
-            self.rows[copies].fill(RowIdentity::Told(owner));
+            let copies = step.first_copy..step.first_copy + step.splats.kept.len() as u32;
+            self.rows[copies.start as usize..copies.end as usize].fill(RowIdentity::Told(owner));
+            // Not in the groups of the original.
+            let is_named = |group: usize| self.tracks.groups[group].instance.is_some();
+            let named: Vec<u32> =
+                copies.filter(|row| self.tracks.group(*row as usize).is_some_and(is_named)).collect();
+            let own = |group| TrackGroup { instance: id, ..group };
+            self.tracks.regroup(&named, &second.name, second.pivot, own);
         }
         let reshaped = step.splats.reshaped.iter().map(|(_, j)| *j);
         let mut positions: Vec<usize> = step.splats.added.iter().copied().chain(reshaped).collect();
@@ -259,7 +266,9 @@ impl Work {
             self.field.sh_degree = degree;
         }
         self.rows.extend(std::iter::repeat_n(RowIdentity::Told(owner), rows.gaussians.len()));
-        rows.append_to(&mut self.field.gaussians, &mut self.tracks);
+        // Groups of an instance that the network moves are not all of it.
+        let is_named = is_new || self.tracks.groups.iter().any(|group| group.instance == id);
+        rows.append_to(&mut self.field.gaussians, &mut self.tracks, id.filter(|_| is_named));
         Ok(())
     }
 
@@ -268,6 +277,7 @@ impl Work {
         field.tracks = tracks.compact();
         (field.instances, field.identities) =
             identities::rebuild(plan, instances.entries, field.identities.as_ref(), &rows);
+        identities::follow_groups(&mut field);
         field.record.edits.push(serde_json::json!({ "file": source, "objects": changes.objects }));
         field
             .validate()

@@ -150,7 +150,7 @@ fn unseen_members(base: &Field, exported: &SceneGraph) -> BTreeMap<usize, Vec<u3
     // As if they could be seen.
     let all: Vec<u32> = (0..base.len() as u32).collect();
     let options = exported.origin.options.clone().unwrap_or_default();
-    let owners = assignment::assign(base, &assignment::most_probable(base), &all, &options);
+    let owners = assignment::assign(base, &assignment::most_probable(base), &all, &options).owners;
     for (row, owner) in owners.into_iter().enumerate().filter(|(row, _)| !is_seen[*row]) {
         if let Some(owner) = owner {
             members.entry(owner).or_default().push(row as u32);

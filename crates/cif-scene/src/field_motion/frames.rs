@@ -115,6 +115,18 @@ impl<'a> Frames<'a> {
         self.times.len() > 1 && self.motion.moves()
     }
 
+    /// True when there is more than one time, and any of these rows can move.
+    #[must_use]
+    pub fn move_rows(&self, rows: &[u32]) -> bool {
+        self.times.len() > 1 && self.motion.moves_rows(rows)
+    }
+
+    /// True where opacities can change.
+    #[must_use]
+    pub fn fade(&self) -> bool {
+        self.times.len() > 1 && self.motion.fades()
+    }
+
     /// True where colours change too.
     #[must_use]
     pub fn recolor(&self) -> bool {

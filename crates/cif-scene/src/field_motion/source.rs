@@ -1,6 +1,6 @@
 //! Where the moved Gaussians come from.
 
-use cif_field::{Field, Gaussians};
+use cif_field::{Deformation, Field, Gaussians, Heads, TrackGroup};
 use cif_render::cpu::{Renderer, SimdLevel};
 
 /// Gives the Gaussians of a field at a time. Rows keep their order and number.
@@ -12,6 +12,21 @@ pub trait MotionSource {
     /// True when anything can move at all.
     fn moves(&self) -> bool {
         true
+    }
+
+    /// True when any of these rows can move.
+    fn moves_rows(&self, _rows: &[u32]) -> bool {
+        self.moves()
+    }
+
+    /// True where rows of track groups follow these.
+    fn follows_tracks(&self) -> bool {
+        false
+    }
+
+    /// True where opacities can change over time.
+    fn fades(&self) -> bool {
+        self.moves()
     }
 
     /// True where colours change over time, other than by turning with a track.
@@ -42,6 +57,16 @@ impl<'a> FieldMotion<'a> {
     }
 }
 
+impl FieldMotion<'_> {
+    fn learns(&self, head: impl Fn(&Heads) -> bool) -> bool {
+        self.field.deformation.as_ref().is_some_and(|deformation| head(&deformation.config.heads))
+    }
+
+    fn any_group(&self, holds: impl Fn(&TrackGroup) -> bool) -> bool {
+        self.field.tracks.iter().flat_map(|tracks| &tracks.groups).any(holds)
+    }
+}
+
 impl MotionSource for FieldMotion<'_> {
     fn gaussians_at(&mut self, time: f64) -> Gaussians {
         match &mut self.renderer {
@@ -54,9 +79,26 @@ impl MotionSource for FieldMotion<'_> {
         self.field.moves()
     }
 
+    fn moves_rows(&self, rows: &[u32]) -> bool {
+        rows.iter().any(|&row| {
+            let tracks = self.field.tracks.as_ref();
+            let group = tracks.and_then(|tracks| Some(&tracks.groups[tracks.group(row as usize)?]));
+            let is_learned = |deformation: &Deformation| !deformation.is_still(row as usize);
+            group.is_some_and(TrackGroup::moves)
+                || group.is_none_or(|group| group.deformed)
+                    && self.field.deformation.as_ref().is_some_and(is_learned)
+        })
+    }
+
+    fn follows_tracks(&self) -> bool {
+        true
+    }
+
+    fn fades(&self) -> bool {
+        self.learns(|heads| heads.opacity) || self.any_group(|group| group.opacities.is_some())
+    }
+
     fn recolors(&self) -> bool {
-        let learned = self.field.deformation.as_ref().is_some_and(|deformation| deformation.config.heads.sh);
-        let mut groups = self.field.tracks.iter().flat_map(|tracks| &tracks.groups);
-        learned || groups.any(|group| group.colors.is_some())
+        self.learns(|heads| heads.sh) || self.any_group(|group| group.colors.is_some())
     }
 }

@@ -16,7 +16,9 @@
 //! 3. Gaussians inside an object are hardly ever seen, so that they keep their first occupancy. One below the
 //!    threshold that lies in the box of its instance's Gaussians, and whose nearest neighbours are mostly of
 //!    that instance, is *enclosed* and goes back to it; else it would stay behind when the object moves.
-//! 4. Where most of the image of an instance moves by poses of its own, that is all of it ([`super::posed`]).
+//! 4. Gaussians of a track group are those of its instance ([`cif_field::TrackGroup::instance`]). Where the learned
+//!    deformation leaves the groups of an instance alone, what else its masks show (shadows of where it was) stays behind
+//!    when it moves, and is background.
 //!
 //! Rows that have an owner ([`cif_field::Owner`]: they came from a file that names its objects) belong to it,
 //! whatever their occupancy.
@@ -31,7 +33,8 @@ use glam::DVec3;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
-use super::posed;
+use super::group_instances;
+use super::image::image;
 use crate::SceneOptions;
 
 /// Neighbours that vote on an enclosed Gaussian.
@@ -82,14 +85,23 @@ pub fn most_probable(field: &Field) -> Vec<Option<Identity>> {
         .collect()
 }
 
-/// Owner of every row of `visible`: a dense instance index, or `None` for the background.
+/// Who owns what, by dense instance index; `None` is the background.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Assignment {
+    /// Owner of every visible row.
+    pub owners: Vec<Option<usize>>,
+    /// Instance of every track group.
+    pub groups: Vec<Option<usize>>,
+}
+
+/// Owners of the rows of `visible`, and instances of the track groups.
 #[must_use]
 pub fn assign(
     field: &Field,
     identities: &[Option<Identity>],
     visible: &[u32],
     options: &SceneOptions,
-) -> Vec<Option<usize>> {
+) -> Assignment {
     let occupancy = occupancies(field, visible);
     let candidate = |position: usize| identities[visible[position] as usize];
     // Candidates with enough instance mass.
@@ -120,8 +132,19 @@ pub fn assign(
     }
     let open = |position: usize| candidate(position).filter(|_| owner_of(position) == Owner::Estimated);
     enclose(field, visible, &open, &mut owners);
-    posed::settle(field, visible, &|position| owner_of(position) == Owner::Estimated, &mut owners);
-    owners
+    let groups = group_instances::of_groups(field, visible, &owners);
+    let is_estimated = |position: &usize| owner_of(*position) == Owner::Estimated;
+    let Some(tracks) = &field.tracks else { return Assignment { owners, groups } };
+    let mut is_posed = vec![false; field.instances.len()];
+    for (_, instance) in tracks.groups.iter().zip(&groups).filter(|(group, _)| !group.deformed) {
+        instance.iter().for_each(|instance| is_posed[*instance] = true);
+    }
+    for position in (0..visible.len()).filter(is_estimated) {
+        let of_group = tracks.group(visible[position] as usize).and_then(|group| groups[group]);
+        let stays = owners[position].filter(|owner| !is_posed[*owner]);
+        owners[position] = of_group.or(stays);
+    }
+    Assignment { owners, groups }
 }
 
 /// Gaussians of every instance, ascending, as the nodes of a graph with these options have them, as far as opacities
@@ -131,18 +154,13 @@ pub fn members(field: &Field, options: &SceneOptions) -> Vec<Vec<u32>> {
     let is_visible = |row: &u32| field.gaussians.opacity(*row as usize) >= options.min_opacity;
     let visible: Vec<u32> = (0..field.len() as u32).filter(is_visible).collect();
     let mut members = vec![Vec::new(); field.instances.len()];
-    for (row, owner) in visible.iter().zip(assign(field, &most_probable(field), &visible, options)) {
+    let owners = assign(field, &most_probable(field), &visible, options).owners;
+    for (row, owner) in visible.iter().zip(owners) {
         if let Some(owner) = owner {
             members[owner].push(*row);
         }
     }
     members
-}
-
-/// Image of a Gaussian seen from its broad side: opacity times area, world units.
-pub(super) fn image(field: &Field, row: usize) -> f64 {
-    let [x, y, z] = field.gaussians.log_scales[row].map(f64::from);
-    f64::from(field.gaussians.opacity(row)) * (x + y).max(y + z).max(x + z).exp()
 }
 
 /// Labelled share above which the Gaussians of every instance make the best silhouette of it.
@@ -231,5 +249,45 @@ fn enclose(
         for (position, index) in joined {
             owners[position] = Some(index);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use cif_field::Identities;
+
+    use super::*;
+    use crate::testing::{MEMBERS, recorded_field};
+
+    #[test]
+    fn what_does_not_move_with_an_object_stays_behind() {
+        let mut field = recorded_field(2, 5);
+        field.tracks.as_mut().unwrap().groups.iter_mut().for_each(|group| group.deformed = false);
+        // A shadow on the ground that the masks give to the first object, and pieces of it that they do not.
+        let (shadow, piece, stray, told) = (2 * MEMBERS + 3, 5, 6, 2 * MEMBERS + 4);
+        let mut rows = Identities::empty();
+        for row in 0..field.len() {
+            match row {
+                _ if row == shadow => rows.push(Owner::Estimated, &[(0, 0.9)]),
+                _ if row == piece => rows.push(Owner::Estimated, &[(0, 0.01)]),
+                _ if row == stray => rows.push(Owner::Estimated, &[(1, 0.9)]),
+                _ if row == told => rows.push(Owner::Instance(0), &[(0, 0.9)]),
+                _ if row < 2 * MEMBERS => rows.push(Owner::Estimated, &[((row / MEMBERS) as u16, 0.9)]),
+                _ => rows.push(Owner::Estimated, &[(0, 0.01)]),
+            }
+        }
+        field.identities = Some(rows);
+        field.validate().unwrap();
+        let all: Vec<u32> = (0..field.len() as u32).collect();
+        let owners =
+            |field: &Field| assign(field, &most_probable(field), &all, &SceneOptions::default()).owners;
+        let owner = |row: usize| Some(row / MEMBERS).filter(|owner| *owner < 2);
+        let expected: Vec<_> =
+            (0..field.len()).map(|row| if row == told { Some(0) } else { owner(row) }).collect();
+        assert_eq!(owners(&field), expected);
+        // Where the network moves the object too, its shadow may be what it left out.
+        field.tracks.as_mut().unwrap().groups[0].deformed = true;
+        let found = owners(&field);
+        assert_eq!((found[shadow], found[piece], found[stray]), (Some(0), Some(0), Some(0)));
     }
 }

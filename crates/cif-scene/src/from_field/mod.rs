@@ -2,8 +2,9 @@
 
 pub mod assignment;
 pub mod camera_tracks;
+mod group_instances;
+mod image;
 pub(crate) mod node;
-mod posed;
 
 use std::collections::BTreeSet;
 
@@ -17,13 +18,13 @@ use crate::appearance::visibility;
 use crate::appearance::{self, Opacities, Thinning};
 use crate::field_motion::FieldMotion;
 use crate::field_motion::frames::{Frame, Frames};
-use crate::from_field::assignment::Identity;
+use crate::from_field::assignment::{Assignment, Identity};
 use crate::from_field::node::{Naming, NodeInput};
 use crate::graph::{Node, NodeKind, Origin, SceneGraph, TimeCodes};
-use crate::joint::{ToldParts, jointed_groups};
 use crate::motion::choose::{self, Chosen};
 use crate::motion::group::{MovingGroup, trimmed_box};
 use crate::motion::loose::{self, Change};
+use crate::motion::recorded;
 use crate::shape::{colliders, flat, proxy};
 use crate::{MotionModel, MotionSource, SceneError, SceneOptions, naming, world};
 
@@ -65,24 +66,21 @@ pub fn build_from(
         });
     }
     let mut warnings: Vec<String> = field.record.unknown.iter().cloned().collect();
-    let recolors = motion.recolors();
+    let (recolors, follows_tracks) = (motion.recolors(), motion.follows_tracks());
     let mut frames_of = Frames::new(motion, &time_codes.times, Frame::of(reference.clone(), recolors));
     let opacities = Opacities::of(&mut frames_of);
     let visible = visible_rows(&reference, &opacities.peak, options, &mut warnings)?;
     let identities = assignment::most_probable(field);
-    let owners = assignment::assign(field, &identities, &visible, options);
+    let mut assigned = assignment::assign(field, &identities, &visible, options);
+    if !follows_tracks {
+        assigned.groups.fill(None);
+    }
     // Instances at rest, which something passes over: known once all have been looked at.
     let mut at_rest = BTreeSet::new();
     let (group_owners, groups, chosen) = loop {
-        let grouped = rows_of_nodes(field, &visible, &owners, &at_rest, &mut frames_of, options);
+        let grouped = rows_of_nodes(field, &visible, &assigned, &at_rest, &mut frames_of, options);
         let (group_owners, mut groups) = moving_groups(grouped, &reference, &opacities.peak, options);
-        let jointed = jointed_groups(field, groups.iter().map(|group| &group.rows[..]));
-        for ((_, group), jointed) in
-            group_owners.iter().zip(&mut groups).zip(&jointed).filter(|((owner, _), _)| owner.is_some())
-        {
-            group.told = ToldParts::of(field, &group.rows, jointed, &time_codes.times);
-        }
-        let chosen = choose::choose(&mut groups, &mut frames_of, &time_codes.samples, options);
+        let chosen = motions(field, &mut groups, &mut frames_of, &reference, &time_codes, options);
         let rest = group_owners
             .iter()
             .zip(&groups)
@@ -170,6 +168,25 @@ pub fn build_from(
         warnings,
         origin: Origin { field_fingerprint: Some(field.fingerprint()), options: Some(options.clone()) },
     })
+}
+
+/// Motion of every group: recorded, or else chosen by what fits.
+fn motions(
+    field: &Field,
+    groups: &mut [MovingGroup],
+    frames: &mut Frames<'_>,
+    reference: &Gaussians,
+    time_codes: &TimeCodes,
+    options: &SceneOptions,
+) -> Vec<Chosen> {
+    let recorded: Vec<Option<Chosen>> = groups
+        .iter_mut()
+        .map(|group| recorded::motion(field, group, reference, time_codes, options))
+        .collect();
+    let open = groups.iter_mut().zip(&recorded).filter(|(_, recorded)| recorded.is_none());
+    let mut open: Vec<&mut MovingGroup> = open.map(|(group, _)| group).collect();
+    let mut fitted = choose::choose(&mut open, frames, &time_codes.samples, options).into_iter();
+    recorded.into_iter().filter_map(|recorded| recorded.or_else(|| fitted.next())).collect()
 }
 
 /// Per instance, how many Gaussians are most probably its own and cannot be drawn.
@@ -288,13 +305,15 @@ struct NodeRows {
     is_passed: bool,
     /// True of splats each of which may have a path of its own, whatever motion is allowed.
     is_loose: bool,
+    /// See [`MovingGroup::recorded`].
+    recorded: Vec<u32>,
 }
 
 impl NodeRows {
     fn of(owner: Option<usize>, rows: Vec<(u32, Change)>) -> Self {
         let (rows, changes): (_, Vec<Change>) = rows.into_iter().unzip();
         let moves = changes.iter().map(Change::shows).collect();
-        Self { owner, rows, moves, is_passed: false, is_loose: false }
+        Self { owner, rows, moves, is_passed: false, is_loose: false, recorded: Vec::new() }
     }
 }
 
@@ -303,13 +322,13 @@ impl NodeRows {
 fn rows_of_nodes(
     field: &Field,
     visible: &[u32],
-    owners: &[Option<usize>],
+    assigned: &Assignment,
     at_rest: &BTreeSet<usize>,
     frames: &mut Frames<'_>,
     options: &SceneOptions,
 ) -> Vec<NodeRows> {
     let mut rows: Vec<Vec<u32>> = vec![Vec::new(); field.instances.len() + 1];
-    for (&row, owner) in visible.iter().zip(owners) {
+    for (&row, owner) in visible.iter().zip(&assigned.owners) {
         rows[owner.unwrap_or(field.instances.len())].push(row);
     }
     let mut background = rows.pop().unwrap_or_default();
@@ -319,7 +338,11 @@ fn rows_of_nodes(
     };
     let mut nodes: Vec<NodeRows> = Vec::with_capacity(rows.len() + 2);
     for (index, rows) in rows.into_iter().enumerate() {
-        let changes = loose::changes(frames, &rows);
+        let recorded = recorded::groups_of(field, &assigned.groups, index, &rows, options);
+        let changes = match recorded.is_empty() {
+            true => loose::changes(frames, &rows),
+            false => vec![Change::default(); rows.len()],
+        };
         let mut own: Vec<(u32, Change)> = rows.into_iter().zip(changes).collect();
         let is_passed = own.iter().any(|(row, change)| passes(*row, change));
         if at_rest.contains(&index) {
@@ -328,7 +351,7 @@ fn rows_of_nodes(
             background.extend(passing.into_iter().map(|(row, _)| row));
             own = rest;
         }
-        nodes.push(NodeRows { is_passed, ..NodeRows::of(Some(index), own) });
+        nodes.push(NodeRows { is_passed, recorded, ..NodeRows::of(Some(index), own) });
     }
     background.sort_unstable();
     let changes = loose::changes(frames, &background);
@@ -358,7 +381,7 @@ fn moving_groups(
 ) -> (Vec<Option<usize>>, Vec<MovingGroup>) {
     let mut largest_instance: f64 = 0.0;
     let (mut group_owners, mut groups) = (Vec::new(), Vec::new());
-    for NodeRows { owner, rows, moves, is_passed, is_loose } in nodes {
+    for NodeRows { owner, rows, moves, is_passed, is_loose, recorded } in nodes {
         let is_body = owner.is_some();
         let weights: Vec<f64> = rows
             .iter()
@@ -386,6 +409,7 @@ fn moving_groups(
             group.weights.iter().zip(moves).filter(|(_, moves)| *moves).map(|(weight, _)| weight).sum();
         group.is_passed = is_passed;
         group.is_loose = is_loose;
+        group.recorded = recorded;
         group.stands_still = moving <= trim * group.weights.iter().sum::<f64>();
         group_owners.push(owner);
         groups.push(group);

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use cif_field::{Embedding, Field, Gaussians, Identities, RotationEvidence};
+use cif_field::{Embedding, Field, Gaussians, Identities};
 use cif_geometry::RigidTransform;
 use cif_geometry::scalar::direct_sigmoid;
 use glam::DVec3;
@@ -10,11 +10,10 @@ use glam::DVec3;
 use crate::field_motion::frames::Frames;
 use crate::from_field::assignment::Identity;
 use crate::graph::{
-    Appearance, DenseMotion, IdentityShare, IdentityShares, Motion, Node, NodeKind, Part, PartsMotion,
-    SHARES_PER_SPLAT, Splats,
+    Appearance, DenseMotion, IdentityShare, IdentityShares, Motion, MotionReport, Node, NodeKind, Part,
+    PartsMotion, ResidualStatistics, SHARES_PER_SPLAT, Splats,
 };
-use crate::graph::{MotionReport, ResidualStatistics};
-use crate::motion::choose::Chosen;
+use crate::motion::choose::{Chosen, ChosenParts};
 use crate::motion::group::{MeanShape, MovingGroup, trimmed_box};
 use crate::motion::residuals::{ResidualSum, add_turns_between};
 use crate::naming;
@@ -78,7 +77,7 @@ pub(crate) struct NodeInput<'a> {
 /// the model before [`measure`].
 pub(crate) fn node(input: &NodeInput<'_>, naming: Naming, group: &MovingGroup, chosen: Chosen) -> Node {
     let order: Option<&[u32]> = match &chosen {
-        Chosen::Parts { parts, .. } => Some(&parts.order),
+        Chosen::Parts(parts) => Some(&parts.order),
         _ => None,
     };
     let rows: Vec<u32> = match order {
@@ -86,7 +85,9 @@ pub(crate) fn node(input: &NodeInput<'_>, naming: Naming, group: &MovingGroup, c
         None => group.rows.clone(),
     };
     let is_instance = matches!(naming.kind, NodeKind::Instance { .. });
-    let mut splats = appearance(input, is_instance, rows);
+    // Recorded poses turn the colours that the field stores.
+    let colors = if group.recorded.is_empty() { input.reference } else { &input.field.gaussians };
+    let mut splats = appearance(input, colors, is_instance, rows);
     let (motion, residual) = match chosen {
         Chosen::Static => {
             take_shape(&mut splats, &group.static_shape);
@@ -96,20 +97,17 @@ pub(crate) fn node(input: &NodeInput<'_>, naming: Naming, group: &MovingGroup, c
             take_shape(&mut splats, &group.rigid_shape);
             (Motion::Rigid(track), group.rigid_residual.statistics())
         }
-        Chosen::Parts { track, parts, tracks } => {
-            let residual = parts.residual.statistics();
-            let mut out = Vec::with_capacity(parts.parts.len());
-            for (number, ((range, part), track)) in parts.parts.into_iter().zip(tracks).enumerate() {
-                take_shape(&mut splats, &part.rigid_shape);
+        Chosen::Parts(ChosenParts { track, parts, residual, .. }) => {
+            let mut out = Vec::with_capacity(parts.len());
+            for (number, part) in parts.into_iter().enumerate() {
+                take_shape(&mut splats, &part.shape);
                 out.push(Part {
                     name: format!("part_{number:02}"),
-                    extent: extent::splat_bounds(&RigidTransform::IDENTITY, &splats, range.clone()),
-                    splats: range,
-                    pivot: part.pivot - group.pivot,
-                    track,
-                    joint: number
-                        .checked_sub(1)
-                        .and_then(|told| Some(group.told.as_ref()?.parts.get(told)?.joint)),
+                    extent: extent::splat_bounds(&RigidTransform::IDENTITY, &splats, part.splats.clone()),
+                    splats: part.splats,
+                    pivot: part.pivot,
+                    track: part.track,
+                    joint: part.joint,
                 });
             }
             (Motion::Parts(PartsMotion { track, parts: out }), residual)
@@ -128,7 +126,6 @@ pub(crate) fn node(input: &NodeInput<'_>, naming: Naming, group: &MovingGroup, c
         }
     };
     let report = motion_report(group, &motion, residual, input);
-    let at_pivot = |part: &Part| RigidTransform { translation: part.pivot, ..RigidTransform::IDENTITY };
     Node {
         kind: naming.kind,
         name: naming.name,
@@ -137,7 +134,7 @@ pub(crate) fn node(input: &NodeInput<'_>, naming: Naming, group: &MovingGroup, c
         taxonomies: naming.taxonomies,
         embedding: naming.embedding,
         pivot: group.pivot,
-        extent: extent::node_bounds(&RigidTransform::IDENTITY, &splats, &motion, at_pivot),
+        extent: extent::node_bounds(&RigidTransform::IDENTITY, &splats, &motion, Part::at_first),
         motion,
         mean_occupancy: splats.mean_occupancy(),
         splats,
@@ -169,15 +166,15 @@ fn used_degree(gaussians: &Gaussians, rows: &[u32], highest: u8) -> u8 {
 }
 
 /// Everything about the splats that no motion model changes.
-fn appearance(input: &NodeInput<'_>, is_instance: bool, rows: Vec<u32>) -> Splats {
+fn appearance(input: &NodeInput<'_>, colors: &Gaussians, is_instance: bool, rows: Vec<u32>) -> Splats {
     let gaussians = input.reference;
-    let degree = used_degree(gaussians, &rows, input.field.sh_degree);
+    let degree = used_degree(colors, &rows, input.field.sh_degree);
     let floats = 3 * cif_geometry::spherical_harmonics::coefficient_count(degree);
     let mut splats = Splats { sh_degree: degree, ..Splats::default() };
     for &row in &rows {
         let row = row as usize;
         splats.opacities.push(direct_sigmoid(gaussians.opacity_logits[row]));
-        splats.sh_coefficients.extend_from_slice(&gaussians.sh_coefficients[row][..floats]);
+        splats.sh_coefficients.extend_from_slice(&colors.sh_coefficients[row][..floats]);
         splats.occupancies.push(direct_sigmoid(gaussians.occupancy_logits[row]));
         let probability = input.identities[row].map_or(0.0, |identity| identity.probability);
         splats.identity_probabilities.push(if is_instance { probability } else { 0.0 });
@@ -213,7 +210,7 @@ fn identity_shares(identities: &Identities, row: usize, ids: &[u16]) -> Identity
     shares
 }
 
-/// Takes the residuals of nodes that move against the trained Gaussians at all sampled times, as the nodes are
+/// Takes the residuals of nodes with a fitted motion against the trained Gaussians at all sampled times, as the nodes are
 /// now: with the samples that were left out interpolated.
 pub(crate) fn measure(
     nodes: &mut [Node],
@@ -226,15 +223,17 @@ pub(crate) fn measure(
     let mut sums = vec![ResidualSum::default(); nodes.len()];
     let weights: Vec<Vec<f64>> =
         nodes.iter().zip(groups).map(|(node, group)| self::weights(node, group)).collect();
-    let moving = |node: &Node| !matches!(node.motion, Motion::Static);
-    if !nodes.iter().any(moving) {
+    let is_fitted = |node: &Node, group: &MovingGroup| {
+        !matches!(node.motion, Motion::Static) && group.recorded.is_empty()
+    };
+    if !nodes.iter().zip(groups).any(|(node, group)| is_fitted(node, group)) {
         return;
     }
     for (step, &time_code) in time_codes.iter().enumerate() {
         let frame = frames.at(step);
         sums.par_iter_mut().zip(nodes.par_iter()).zip(groups).zip(&weights).for_each(
             |(((sum, node), group), weights)| {
-                if moving(node) {
+                if is_fitted(node, group) {
                     let placed = node.splats_at(time_code);
                     let distances: Vec<f64> = placed
                         .means
@@ -248,8 +247,8 @@ pub(crate) fn measure(
             },
         );
     }
-    for (node, sum) in nodes.iter_mut().zip(&sums) {
-        if moving(node) {
+    for ((node, group), sum) in nodes.iter_mut().zip(groups).zip(&sums) {
+        if is_fitted(node, group) {
             node.report.residual = sum.statistics();
         }
     }
@@ -262,14 +261,6 @@ pub(crate) fn weights(node: &Node, group: &MovingGroup) -> Vec<f64> {
     rows.map(|row| position(row).map_or(0.0, |position| group.weights[position])).collect()
 }
 
-/// Evidence for the rotations of the track that most of the rows follow.
-fn rotation_evidence(field: &Field, rows: &[u32]) -> Option<RotationEvidence> {
-    let tracks = field.tracks.as_ref()?;
-    let followed = |group: u32| rows.iter().filter(|row| tracks.group_of[**row as usize] == group).count();
-    let group = (0..tracks.groups.len()).find(|group| 2 * followed(*group as u32) > rows.len())?;
-    tracks.groups[group].rotation
-}
-
 fn motion_report(
     group: &MovingGroup,
     motion: &Motion,
@@ -277,10 +268,12 @@ fn motion_report(
     input: &NodeInput<'_>,
 ) -> MotionReport {
     let (low, high) = trimmed_box(&group.rows, &group.weights, &input.reference.means);
+    let recorded = group.recorded.first().map(|group| *group as usize);
+    let evidence = || input.field.tracks.as_ref()?.groups.get(recorded?)?.rotation;
     MotionReport {
         model: motion.model(),
         rotation: match motion {
-            Motion::Rigid(_) => rotation_evidence(input.field, &group.rows),
+            Motion::Rigid(_) => evidence(),
             Motion::Static | Motion::Parts(_) | Motion::Dense(_) => None,
         },
         gaussians: group.rows.len(),
@@ -288,7 +281,7 @@ fn motion_report(
         tolerance: group.tolerance,
         residual,
         static_residual: group.static_residual.statistics(),
-        rigid_residual: group.is_body.then(|| group.rigid_residual.statistics()),
+        rigid_residual: (group.is_body && recorded.is_none()).then(|| group.rigid_residual.statistics()),
         parts_residual: group.parts_residual,
         parts: motion.part_count(),
         samples: motion.sample_count(),

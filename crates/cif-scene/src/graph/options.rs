@@ -8,7 +8,7 @@ use cif_geometry::UpAxis;
 
 use super::motion::MotionModel;
 
-/// Largest deviation of a simplified motion from the trained one.
+/// Largest deviation of a fitted motion from the trained one. Recorded poses are not fitted.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Tolerance {
@@ -105,7 +105,8 @@ impl FromStr for FrameRange {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SceneOptions {
-    /// Largest residual of a simplified motion. Default 0.2 % of the instance size.
+    /// Largest residual of a motion that is fitted: of everything but recorded poses, which leave as they are
+    /// ([`crate::motion`]). Default 0.2 % of the instance size.
     pub tolerance: Tolerance,
     /// Largest RMS error of opacities and colours that change over time, in units of opacity and of
     /// spherical-harmonics coefficients; 0 keeps them at every sampled frame. Default 0.01.
@@ -123,9 +124,10 @@ pub struct SceneOptions {
     /// the share of labelled pixels decides alone. Colour is drawn by opacity, so that many splats of an object keep
     /// occupancies near their start of 0.02; a threshold above leaves their colour behind when the object moves.
     pub background_threshold: f32,
-    /// Most rigid parts of an instance, 2 to 64; what needs more becomes dense. Default 8.
+    /// Most rigid parts of an instance that are looked for, 2 to 64; what needs more becomes dense. Default 8.
     pub max_parts: usize,
-    /// Leave out samples that interpolation reproduces inside the tolerance. Default true.
+    /// Leave out samples that interpolation reproduces: inside the tolerance, or up to rounding where poses are recorded.
+    /// Default true.
     pub reduce_keys: bool,
     /// Most convex hulls of an instance, 0 for no colliders. More than one pay for concave instances. Default 1.
     pub hulls_per_instance: usize,

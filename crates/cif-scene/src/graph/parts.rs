@@ -1,7 +1,7 @@
 //! Motion of a few rigid parts, and the joints between them: a door on its hinge, a drawer on its rails.
 
 use cif_field::JointKind;
-use cif_geometry::Bounds;
+use cif_geometry::{Bounds, RigidTransform};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
@@ -10,7 +10,7 @@ use super::pose::{PoseSample, pose_at};
 /// A few rigid parts under one node.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PartsMotion {
-    /// Path of the node's local frame, which follows its largest part; empty where it stays at the pivot.
+    /// Path of the node's local frame, which follows its first part; empty where it stays at the pivot.
     pub track: Vec<PoseSample>,
     /// The parts, at least two. Their [`Part::splats`] partition [`Node::splats`] in order.
     pub parts: Vec<Part>,
@@ -44,6 +44,15 @@ pub struct PartJoint {
     pub axis: DVec3,
     /// A point of the axis, frame of the part.
     pub anchor: DVec3,
+}
+
+impl Part {
+    /// `node_from_part` at the first key, or at the pivot without keys.
+    #[must_use]
+    pub fn at_first(&self) -> RigidTransform {
+        let rest = RigidTransform { translation: self.pivot, ..RigidTransform::IDENTITY };
+        self.track.first().map_or(rest, PoseSample::transform)
+    }
 }
 
 impl PartsMotion {

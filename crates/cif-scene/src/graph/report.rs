@@ -54,13 +54,14 @@ pub struct MotionReport {
     /// Diagonal of the box of the centres at the reference time, outermost 2 % of the weight left out, world
     /// units.
     pub size: f64,
-    /// Largest `decisive` residual allowed, world units.
+    /// Largest `decisive` residual allowed to a fitted motion, world units.
     pub tolerance: f64,
-    /// Residual of what is exported: of the chosen model, with the samples that were left out interpolated.
+    /// Residual of what is exported: of the chosen model, with the samples that were left out interpolated; zero for
+    /// recorded poses.
     pub residual: ResidualStatistics,
-    /// Residual of the static model.
+    /// Residual of the static model; zero where the poses are those that the field records, as nothing is fitted then.
     pub static_residual: ResidualStatistics,
-    /// Residual of one rigid body; `None` for the background, which is never one body.
+    /// Residual of one rigid body; `None` where poses are recorded, and for the background, which is never one body.
     pub rigid_residual: Option<ResidualStatistics>,
     /// Residual of the best rigid parts; `None` where they were not tried.
     #[serde(default)]

@@ -8,9 +8,12 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use crate::field_motion::frames::{Frame, Frames};
-use crate::graph::{DENSE_BYTES, DenseSample, MotionModel, POSE_BYTES, PoseSample, SceneOptions, pose_at};
+use crate::graph::{
+    DENSE_BYTES, DenseSample, MotionModel, POSE_BYTES, PartJoint, PoseSample, ResidualStatistics,
+    SceneOptions, pose_at,
+};
 use crate::motion::dense;
-use crate::motion::group::{MovingGroup, trimmed_box};
+use crate::motion::group::{MeanShape, MovingGroup, trimmed_box};
 use crate::motion::keys::{self, Moments};
 use crate::motion::parts::{self, Partition};
 use crate::motion::residuals::ResidualSum;
@@ -32,28 +35,53 @@ const ROUNDING: f64 = 1e-6;
 pub(crate) enum Chosen {
     Static,
     Rigid(Vec<PoseSample>),
-    Parts { track: Vec<PoseSample>, parts: FittedParts, tracks: Vec<Vec<PoseSample>> },
+    Parts(ChosenParts),
     Dense { track: Vec<PoseSample>, samples: Vec<DenseSample> },
 }
 
-/// Rigid parts, fitted to all Gaussians and times of a group.
-pub(crate) struct FittedParts {
+/// Rigid parts of a group.
+pub(crate) struct ChosenParts {
+    /// Path of the node.
+    pub(crate) track: Vec<PoseSample>,
     /// Positions of the group, part by part.
     pub(crate) order: Vec<u32>,
-    /// Range of `order` of every part, and its shape and poses in the world.
-    pub(crate) parts: Vec<(Range<usize>, MovingGroup)>,
+    pub(crate) parts: Vec<RigidPart>,
     /// Residual of all parts together.
-    pub(crate) residual: ResidualSum,
+    pub(crate) residual: ResidualStatistics,
+}
+
+/// A rigid part of a group.
+#[derive(Default)]
+pub(crate) struct RigidPart {
+    /// Range of [`ChosenParts::order`].
+    pub(crate) splats: Range<usize>,
+    /// Its splats, in its frame.
+    pub(crate) shape: MeanShape,
+    /// Origin of its frame in that of the node, at the reference time.
+    pub(crate) pivot: DVec3,
+    /// Poses `node_from_part`; empty where it stays at its pivot.
+    pub(crate) track: Vec<PoseSample>,
+    pub(crate) joint: Option<PartJoint>,
+}
+
+/// Rigid parts, fitted to all Gaussians and times of a group.
+struct FittedParts {
+    /// Positions of the group, part by part.
+    order: Vec<u32>,
+    /// Range of `order` of every part, and its shape and poses in the world.
+    parts: Vec<(Range<usize>, MovingGroup)>,
+    /// Residual of all parts together.
+    residual: ResidualSum,
 }
 
 /// Fits every model that is needed to decide, and decides.
 pub(crate) fn choose(
-    groups: &mut [MovingGroup],
+    groups: &mut [&mut MovingGroup],
     frames: &mut Frames<'_>,
     time_codes: &[f64],
     options: &SceneOptions,
 ) -> Vec<Chosen> {
-    if !frames.moves() {
+    if !groups.iter().any(|group| frames.move_rows(&group.rows)) {
         let frame = frames.at(0);
         for group in groups.iter_mut() {
             group.gather_shape(&frame);
@@ -81,7 +109,7 @@ pub(crate) fn choose(
 }
 
 /// Both passes of [`crate::motion`].
-fn follow(groups: &mut [MovingGroup], frames: &mut Frames<'_>) {
+fn follow(groups: &mut [&mut MovingGroup], frames: &mut Frames<'_>) {
     for step in 0..frames.len() {
         let frame = frames.at(step);
         groups.par_iter_mut().for_each(|group| group.timed(|group| group.gather_shape(&frame)));
@@ -104,7 +132,7 @@ fn inside(group: &MovingGroup, residual: &ResidualSum) -> bool {
 
 /// Parts of the groups that neither stand still nor are rigid inside the tolerance.
 fn fit_parts_where_needed(
-    groups: &mut [MovingGroup],
+    groups: &mut [&mut MovingGroup],
     frames: &mut Frames<'_>,
     options: &SceneOptions,
 ) -> Vec<Option<FittedParts>> {
@@ -143,10 +171,6 @@ fn fit_parts_where_needed(
 
 /// The fewest parts inside the tolerance, or else the best there are.
 fn fit_parts(group: &MovingGroup, own: &[Frame], options: &SceneOptions) -> Option<FittedParts> {
-    if let Some(told) = &group.told {
-        let partition = Partition { labels: told.labels.clone(), count: told.parts.len() + 1, decisive: 0.0 };
-        return Some(fit_partition(group, own, &partition));
-    }
     let partitions = parts::partitions(own, &group.weights, group.tolerance, group.trim, options.max_parts);
     let promising = partitions.iter().filter(|partition| partition.decisive <= PROMISING * group.tolerance);
     let mut best: Option<FittedParts> = None;
@@ -176,9 +200,7 @@ fn fit_partition(group: &MovingGroup, own: &[Frame], partition: &Partition) -> F
         let rows = order[start..].to_vec();
         let weights: Vec<f64> = rows.iter().map(|&k| group.weights[k as usize]).collect();
         let (low, high) = trimmed_box(&rows, &weights, &own[0].means);
-        let told = part.checked_sub(1).and_then(|part| group.told.as_ref()?.parts.get(part));
-        // On the axis, which poses between keys then leave alone.
-        let pivot = told.map_or((low + high) / 2.0, |told| told.poses[0].translation);
+        let pivot = (low + high) / 2.0;
         let part = MovingGroup::new(rows, weights, pivot, true, 0.0, group.tolerance, &own[0].means);
         parts.push((start..order.len(), part));
     }
@@ -192,9 +214,6 @@ fn fit_partition(group: &MovingGroup, own: &[Frame], partition: &Partition) -> F
         let distances: Vec<f64> =
             parts.iter_mut().flat_map(|(_, part)| part.gather_residuals(frame)).collect();
         residual.add(&distances, &weights, group.trim, group.tolerance);
-    }
-    for ((_, part), told) in parts.iter_mut().skip(1).zip(group.told.iter().flat_map(|told| &told.parts)) {
-        part.poses.clone_from(&told.poses);
     }
     FittedParts { order, parts, residual }
 }
@@ -217,9 +236,6 @@ fn decide(group: &MovingGroup, parts: &Option<FittedParts>, options: &SceneOptio
     }
     if inside(group, &group.rigid_residual) || limit == MotionModel::Rigid {
         return MotionModel::Rigid;
-    }
-    if group.told.is_some() && parts.is_some() {
-        return MotionModel::Parts;
     }
     let cheaper_than_dense =
         |parts: &FittedParts| (parts.parts.len() + 1) * POSE_BYTES < group.rows.len() * DENSE_BYTES;
@@ -257,12 +273,16 @@ fn with_tracks(
         }
         (MotionModel::Parts, Some(parts)) => {
             let track = leading_track(group, &parts, time_codes, options);
-            let tracks = parts
-                .parts
-                .iter()
-                .map(|(_, part)| part_track(group, &track, part, &parts.residual, time_codes, options))
-                .collect();
-            Chosen::Parts { track, parts, tracks }
+            let residual = parts.residual.statistics();
+            let part = |(splats, part): (Range<usize>, MovingGroup)| RigidPart {
+                splats,
+                pivot: part.pivot - group.pivot,
+                track: part_track(group, &track, &part, &parts.residual, time_codes, options),
+                shape: part.rigid_shape,
+                joint: None,
+            };
+            let of_parts = parts.parts.into_iter().map(part).collect();
+            Chosen::Parts(ChosenParts { track, order: parts.order, parts: of_parts, residual })
         }
         _ => {
             let track = if group.is_body { bulk_track(group, full.clone(), options) } else { Vec::new() };
@@ -356,7 +376,7 @@ fn part_track(
 
 /// The splats of dense groups at every time, relative to their tracks.
 fn gather_dense(
-    groups: &mut [MovingGroup],
+    groups: &mut [&mut MovingGroup],
     chosen: &mut [Chosen],
     frames: &mut Frames<'_>,
     time_codes: &[f64],

@@ -1,5 +1,6 @@
 //! Gaussians of one node, with the fits of a static model and of one rigid body.
 
+use cif_field::Gaussians;
 use cif_geometry::align::procrustes::{residuals, robust_procrustes};
 use cif_geometry::stats::weighted_quantile;
 use cif_geometry::{RigidTransform, quaternion};
@@ -9,7 +10,6 @@ use super::keys::one_hemisphere;
 use super::residuals::{ResidualSum, add_turns_between};
 use crate::field_motion::frames::Frame;
 use crate::graph::{PoseSample, ResidualStatistics};
-use crate::joint::ToldParts;
 use crate::shape::proxy::systematic;
 use crate::vectors::{dot, quaternion_of, vector};
 
@@ -52,8 +52,9 @@ pub struct MovingGroup {
     pub rigid_residual: ResidualSum,
     /// Residuals of rigid parts, where they were tried.
     pub parts_residual: Option<ResidualStatistics>,
-    /// Parts that the field ties by joints, which are taken as they are.
-    pub(crate) told: Option<ToldParts>,
+    /// Track groups of the field whose poses the node has as they are, ascending; empty where its motion is fitted
+    /// ([`crate::motion::recorded`]).
+    pub recorded: Vec<u32>,
     /// Seconds spent on the group.
     pub seconds: f64,
     reference: Vec<DVec3>,
@@ -99,6 +100,18 @@ impl MeanShape {
             }
         }
         self.count += 1.0;
+    }
+
+    /// Gaussians as they are, around the origin of each.
+    pub(crate) fn of(gaussians: &Gaussians, rows: &[u32], origin: impl Fn(u32) -> DVec3) -> Self {
+        let orientation =
+            |row: &u32| quaternion::try_normalize(gaussians.quaternions[*row as usize].map(f64::from));
+        Self {
+            means: rows.iter().map(|&row| vector(gaussians.means[row as usize]) - origin(row)).collect(),
+            orientations: rows.iter().map(|row| orientation(row).unwrap_or([1.0, 0.0, 0.0, 0.0])).collect(),
+            log_scales: rows.iter().map(|&row| vector(gaussians.log_scales[row as usize])).collect(),
+            count: 1.0,
+        }
     }
 
     fn finish(&mut self) {
@@ -166,7 +179,7 @@ impl MovingGroup {
             static_residual: ResidualSum::default(),
             rigid_residual: ResidualSum::default(),
             parts_residual: None,
-            told: None,
+            recorded: Vec::new(),
             seconds: 0.0,
             reference,
             fit_points,

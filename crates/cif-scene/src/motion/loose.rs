@@ -39,7 +39,7 @@ pub(crate) struct Change {
 
 /// How each of `rows` changes over the sampled times.
 pub(crate) fn changes(frames: &mut Frames<'_>, rows: &[u32]) -> Vec<Change> {
-    if !frames.moves() {
+    if !frames.move_rows(rows) {
         return vec![Change::default(); rows.len()];
     }
     let first = frames.at(0);

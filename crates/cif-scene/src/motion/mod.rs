@@ -1,4 +1,5 @@
-//! Fit of a static model and of one rigid body to a group of Gaussians.
+//! Motion of a node: the poses that its field records ([`recorded`]), or else a fit of a static model and of one rigid
+//! body to a group of Gaussians.
 //!
 //! Two passes over the sampled times, so that no more than one time's Gaussians are in memory:
 //! 1. poses against the shape at the reference time, which give the mean shape (in the world for static, in
@@ -13,6 +14,7 @@ pub mod group;
 pub mod keys;
 pub mod loose;
 pub mod parts;
+pub(crate) mod recorded;
 pub mod residuals;
 pub(crate) mod time_map;
 pub mod velocity;

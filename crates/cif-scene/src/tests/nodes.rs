@@ -348,6 +348,7 @@ fn what_changes_over_time_comes_back_from_the_graph() {
             .iter()
             .map(|time| TrackPose { time: *time, translation: DVec3::X * *time, rotation: turn(*time) })
             .collect(),
+        instance: Some(field.instances[0].id),
         rotation: Some(RotationEvidence::Assumed),
         opacities: Some(Samples { times: times.clone(), values: opacities }),
         colors: Some(Samples { times: times.clone(), values: colors }),

@@ -1,7 +1,7 @@
 //! From a scene graph back to a field.
 //!
 //! Every node becomes Gaussians at their place at the first sampled time, in world coordinates, and its motion
-//! a group of [`Tracks`] relative to there. Rigid tracks keep their keys; parts are sampled at the keys of both
+//! a group of [`Tracks`] relative to there, which names the instance. Rigid tracks keep their keys; parts are sampled at the keys of both
 //! levels and at all sampled time codes; dense samples stay samples. Instances keep their ids, nodes without
 //! one get the next that is free, and every Gaussian belongs to its node ([`cif_field::Owner`]). Identity rows
 //! that the file has come back; without them Gaussians of instances are certain of theirs, and those of the
@@ -68,7 +68,8 @@ pub fn field_from_graph(graph: &SceneGraph, source: &str) -> Result<Field, Scene
             rows.gaussians.occupancy_logits.fill(saturated_logit(INITIAL_OCCUPANCY));
         }
         push_identities(&mut identities, node, owner, &index_of);
-        rows.append_to(&mut gaussians, &mut tracks);
+        let instance = owner.map(|index| instances.entries[usize::from(index)].id);
+        rows.append_to(&mut gaussians, &mut tracks, instance);
     }
     let cameras = cameras(&graph.cameras, &times);
     let degrees = graph.nodes.iter().map(|node| node.splats.sh_degree);

@@ -1,7 +1,5 @@
 //! Gaussians of a node, and the track groups that move them.
 
-use std::collections::BTreeSet;
-
 use cif_field::Gaussians;
 use cif_field::gaussians::{SH_FLOATS, saturated_logit};
 use cif_field::tracks::{DenseTrack, Joint, NO_GROUP, Samples, TrackGroup, Tracks, VisibilityStep};
@@ -64,21 +62,14 @@ impl NodeRows {
         Ok(rows)
     }
 
-    /// Drops groups that do nothing and that no joint is on.
+    /// Drops the groups of a node that does nothing.
     fn drop_idle(&mut self) {
-        let bases: BTreeSet<u32> =
-            self.groups.iter().filter_map(|(_, group)| Some(group.joint?.base)).collect();
-        let is_kept = |(index, (_, group)): (usize, &(std::ops::Range<usize>, TrackGroup))| {
-            let is_idle = group.poses.is_empty() && group.visibility.is_empty() && group.dense.is_none();
-            group.moves() || !is_idle || bases.contains(&(index as u32))
+        let is_idle = |(_, group): &(std::ops::Range<usize>, TrackGroup)| {
+            !group.moves() && group.poses.is_empty() && group.visibility.is_empty() && group.dense.is_none()
         };
-        let kept: Vec<bool> = self.groups.iter().enumerate().map(is_kept).collect();
-        let place = |old: u32| kept[..old as usize].iter().filter(|kept| **kept).count() as u32;
-        for (_, group) in &mut self.groups {
-            group.joint = group.joint.map(|joint| Joint { base: place(joint.base), ..joint });
+        if self.groups.iter().all(is_idle) {
+            self.groups.clear();
         }
-        let mut flags = kept.iter();
-        self.groups.retain(|_| *flags.next().expect("one flag per group"));
     }
 
     /// Ties the groups of parts, which were placed one after the other, by the joints of the parts.
@@ -167,14 +158,15 @@ impl NodeRows {
         self.groups.extend(gaps.into_iter().map(|gap| (gap, still.clone())));
     }
 
-    /// Adds the rows at the end of a set with tracks.
-    pub(crate) fn append_to(self, gaussians: &mut Gaussians, tracks: &mut Tracks) {
+    /// Adds the rows at the end of a set with tracks, in groups of an instance (an id).
+    pub(crate) fn append_to(self, gaussians: &mut Gaussians, tracks: &mut Tracks, instance: Option<u16>) {
         let first = gaussians.len();
         gaussians.append(&self.gaussians);
         tracks.group_of.resize(gaussians.len(), NO_GROUP);
         let before = tracks.groups.len() as u32;
         for (range, mut group) in self.groups {
             group.joint = group.joint.map(|joint| Joint { base: before + joint.base, ..joint });
+            group.instance = instance;
             tracks.group_of[first + range.start..first + range.end].fill(tracks.groups.len() as u32);
             tracks.groups.push(group);
         }

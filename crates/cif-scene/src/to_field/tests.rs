@@ -334,7 +334,7 @@ fn joints_leave_with_their_parts_and_come_back() {
         assert_eq!((told.base, told.kind, told.anchor), (0, kind, DVec3::ZERO));
         let [low, high] = parts.joint_range(1).unwrap();
         let most = 0.9 * (TIMES[TIMES.len() - 1] - TIMES[0]);
-        assert!(low.abs() < 1e-4 && (high - most).abs() < 1e-2 * most, "{kind}: {low} to {high}, not {most}");
+        assert!(low.abs() < 1e-9 && (high - most).abs() < 1e-9, "{kind}: {low} to {high}, not {most}");
         // The part stays on its axis at all keys.
         let first = parts.at_first(1).unwrap();
         for key in &parts.parts[1].track {
@@ -343,8 +343,8 @@ fn joints_leave_with_their_parts_and_come_back() {
             let across = moved - told.axis * told.axis.dot(moved);
             let off = if kind == JointKind::Revolute { moved.length() } else { across.length() };
             let turn = (first.rotation.conjugate() * pose.rotation).xyz();
-            assert!(off < 1e-4, "{kind}: {off} from the axis");
-            assert!(turn.cross(told.axis).length() < 1e-4, "{kind}: turned by {turn}");
+            assert!(off < 1e-9, "{kind}: {off} from the axis");
+            assert!(turn.cross(told.axis).length() < 1e-9, "{kind}: turned by {turn}");
         }
         let back = field_from_graph(&graph, "memory").unwrap().tracks.unwrap();
         let group = back.groups.iter().position(|group| group.joint.is_some()).unwrap();
@@ -352,6 +352,6 @@ fn joints_leave_with_their_parts_and_come_back() {
         assert_eq!(joint.kind, kind);
         assert!((joint.axis.length() - 1.0).abs() < 1e-9);
         let last = values[values.len() - 1];
-        assert!((last - most).abs() < 1e-2 * most, "{kind}: {last}, not {most}");
+        assert!((last - most).abs() < 1e-6, "{kind}: {last}, not {most}");
     }
 }

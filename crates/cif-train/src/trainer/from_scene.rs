@@ -77,8 +77,7 @@ impl Trainer {
             gaussians: field.gaussians.len(),
             train: serde_json::to_value(&field.record.run).unwrap_or_default(),
         });
-        field.identities = None;
-        field.instances = initialize::instances(&dataset);
+        field.replace_instances(initialize::instances(&dataset));
         field.gaussians.occupancy_logits.fill(logit(config.instance.occupancy));
         (field.background, field.sort_metric) = (config.background, config.sort_metric);
         let mut trainer = Self::assemble(

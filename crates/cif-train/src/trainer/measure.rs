@@ -52,8 +52,7 @@ impl Trainer {
         if field.identities.is_some() && stage == Stage::Instance {
             check_instances(&field, &dataset)?;
         } else {
-            field.identities = None;
-            field.instances = initialize::instances(&dataset);
+            field.replace_instances(initialize::instances(&dataset));
         }
         if stage == Stage::Coarse {
             field.deformation = None;

@@ -4,6 +4,7 @@
 use cif_dataset::PointSource;
 use cif_dataset::meant::known_names;
 use cif_field::Gaussians;
+use cif_field::Instance;
 use cif_field::tracks::{NO_GROUP, RotationEvidence, TrackGroup, TrackPose, Tracks};
 use cif_render::cpu::Renderer;
 use cif_render::{Channels, RenderSettings};
@@ -265,7 +266,8 @@ impl Trainer {
     /// Gives an object (a label: dense index + 1) that was fitted a group with Gaussians; false where it was not. What
     /// moves as a whole joins `posed`, with its group.
     pub(super) fn add_object(&mut self, label: u16, posed: &mut Vec<Posed>) -> bool {
-        let name = self.state.field.instances[usize::from(label) - 1].label.clone();
+        let instance = self.state.field.instances[usize::from(label) - 1].clone();
+        let name = &instance.label;
         if let Some(fitted) = self.state.objects.moving(label).cloned() {
             let how = match fitted.rotation {
                 RotationEvidence::Observed => "",
@@ -275,15 +277,15 @@ impl Trainer {
                 "{name} moves as a whole: {}{how} (error {:.3} on pixels left out)",
                 fitted.way, fitted.error
             )));
-            let group = self.join(name, &fitted);
+            let group = self.join(&instance, &fitted);
             posed.push(Posed { label, group });
             return true;
         }
         if let Some(found) = self.state.objects.jointed(label).cloned() {
-            self.add_parts(name, &found);
+            self.add_parts(&instance, &found);
             return true;
         }
-        self.messages.extend(self.warning_without_poses(label, &name));
+        self.messages.extend(self.warning_without_poses(label, name));
         false
     }
 
@@ -315,7 +317,7 @@ impl Trainer {
 
     /// Adds the Gaussians of an object to the field, where the best of its poses puts them, in a group of their own, of
     /// which it returns the place.
-    fn join(&mut self, name: String, fitted: &Fitted) -> u32 {
+    fn join(&mut self, instance: &Instance, fitted: &Fitted) -> u32 {
         let (rotation, place) = fitted.reference;
         let mut rows = fitted.gaussians.clone();
         for (mean, quaternion) in rows.means.iter_mut().zip(&mut rows.quaternions) {
@@ -342,7 +344,7 @@ impl Trainer {
             }
         }
         let rotation = Some(fitted.rotation);
-        let group = TrackGroup { deformed: false, poses, rotation, ..TrackGroup::still(name, place) };
+        let group = TrackGroup { poses, rotation, ..TrackGroup::of_instance(instance, place) };
         let shares: Vec<f64> = fitted.shares.values().copied().collect();
         self.add_group(rows, group, &shares)
     }

@@ -1,6 +1,7 @@
 //! Objects with a part on a joint: found where an object rests but for a part, given Gaussians in two groups, of which
 //! that of the part moves on the joint.
 
+use cif_field::Instance;
 use cif_field::tracks::{Joint, TrackGroup};
 use rayon::prelude::*;
 
@@ -63,13 +64,14 @@ impl Trainer {
     }
 
     /// Gives an object with a part groups for both.
-    pub(super) fn add_parts(&mut self, name: String, found: &Jointed) {
+    pub(super) fn add_parts(&mut self, instance: &Instance, found: &Jointed) {
         let [with, without] = found.errors;
+        let name = &instance.label;
         self.messages.push(TrainEvent::note(format!(
             "{name} rests, but {} (error {with:.3} on pixels left out, {without:.3} without)",
             found.told()
         )));
-        let base = TrackGroup { deformed: false, ..TrackGroup::still(name.clone(), found.hinge.point) };
+        let base = TrackGroup::of_instance(instance, found.hinge.point);
         let base = self.add_group(found.base.clone(), base, &[]);
         let times = &self.state.dataset.times;
         let values: Vec<(f64, f64)> =

@@ -7,10 +7,10 @@ use std::io::Read;
 use std::path::Path;
 
 use super::model::MODELS;
-use super::{Camera, Image, Reconstruction};
+use super::reconstruction::{Camera, Image, Reconstruction};
 use crate::Error;
 use crate::files::listing;
-use crate::points::RawPoints;
+use crate::files::points::RawPoints;
 
 /// Reads the three files; points may be missing.
 ///

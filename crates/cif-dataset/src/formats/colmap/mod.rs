@@ -6,6 +6,7 @@
 
 mod binary;
 mod model;
+mod reconstruction;
 mod text;
 
 use std::collections::BTreeMap;
@@ -15,38 +16,14 @@ use cif_geometry::transform::angle_between;
 use cif_geometry::{Bounds, RigidTransform, Similarity};
 use glam::{DMat3, DQuat, DVec3};
 
-use super::{
-    Draft, DraftCamera, DraftFrame, Source, customary_points, hold_out_every_eighth, some_of, transforms,
+use self::reconstruction::{Image, Reconstruction};
+use super::draft::{
+    Draft, DraftCamera, DraftFrame, Source, customary_points, hold_out_every_eighth, some_of,
 };
+use super::transforms;
 use crate::files::listing;
-use crate::points::RawPoints;
+use crate::files::points::RawPoints;
 use crate::{Error, Split};
-
-/// A row of `cameras`.
-struct Camera {
-    model: String,
-    size: [f64; 2],
-    params: Vec<f64>,
-}
-
-/// A row of `images`.
-struct Image {
-    name: String,
-    /// (w, x, y, z), world to camera.
-    rotation: [f64; 4],
-    translation: [f64; 3],
-    camera: u32,
-}
-
-/// A reconstruction as its three files tell it.
-struct Reconstruction {
-    cameras: BTreeMap<u32, Camera>,
-    cameras_path: PathBuf,
-    images: Vec<Image>,
-    images_path: PathBuf,
-    points: RawPoints,
-    points_path: PathBuf,
-}
 
 /// The model that is read of those that the mapper made, and the note on the others.
 pub(crate) struct Chosen {

@@ -5,7 +5,7 @@ use std::path::Path;
 use cif_geometry::{LensDistortion, RigidTransform};
 use glam::DVec2;
 
-use super::Camera;
+use super::reconstruction::Camera;
 use crate::Error;
 use crate::formats::{DraftCamera, DraftFocal};
 

@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::str::FromStr;
 
-use super::{Camera, Image, Reconstruction};
+use super::reconstruction::{Camera, Image, Reconstruction};
 use crate::Error;
 use crate::files::listing;
-use crate::points::RawPoints;
+use crate::files::points::RawPoints;
 
 /// Reads the three files; points may be missing.
 ///

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::draw::Content;
-use super::{Listing, Picture, Place, files_below};
+use super::files_below::files_below;
+use super::picture::{Content, Listing, Picture, Place};
 use crate::Error;
 use crate::files::{listing, npy};
 

@@ -9,9 +9,9 @@ use std::path::Path;
 
 use roxmltree::{Document, Node};
 
-use super::draw::{Content, Piece, Shape};
 use super::frames::Task;
-use super::{Listing, Picture, Place, polygon, runs};
+use super::picture::{Content, Listing, Picture, Piece, Place, Shape};
+use super::{polygon, runs};
 use crate::Error;
 
 /// Larger files are not annotations.

@@ -1,49 +1,25 @@
 //! Which object a pixel belongs to.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
-use std::sync::Arc;
 
 use cif_geometry::PixelGrid;
 
 use super::coverage::Coverage;
-use super::mattes::Matte;
-use super::tracker::Table;
-use super::{Drawn, Picture, Place, check_aspect, check_size, check_stated, mattes, polygon, runs, tracker};
+use super::picture::{Content, Picture, Piece, Place, Shape};
+use super::{mattes, polygon, runs, tracker};
 use crate::Error;
 use crate::files::{exr_header, mask};
 use crate::orientation::Turn;
+use crate::sizes::same_aspect;
 
-/// What a picture consists of.
-pub(super) enum Content {
-    /// A file with a value or a colour per pixel.
-    Values(PathBuf, Arc<Table>),
-    /// Values, row by row, at the stated size, and the objects that they stand for.
-    Ids(Arc<Vec<Option<usize>>>, Vec<u16>),
-    /// Objects one by one, which may overlap.
-    Pieces(Vec<Piece>),
-}
-
-/// A part of an object in a picture.
-pub(super) struct Piece {
-    /// Index into the objects of the source.
-    pub(super) object: usize,
-    /// Pieces on higher layers cover those below.
-    pub(super) layer: i64,
-    pub(super) place: Place,
-    pub(super) shape: Shape,
-}
-
-/// Which pixels a piece covers.
-pub(super) enum Shape {
-    /// Outlines whose areas add up; corners in pixels from the top left corner of the picture.
-    Polygons(Vec<Vec<[f64; 2]>>),
-    /// Run-length code and the size that it is for, where the source says it.
-    Runs(runs::Code, Option<(u32, u32)>),
-    /// Picture file of one object: covered where it is white or opaque by a half.
-    File(PathBuf),
-    /// Channel of an EXR file, covered from a half on.
-    Matte(Matte),
+/// The mask of a frame.
+pub struct Drawn {
+    /// Id of every pixel, 0 for unlabelled, at the size of the frame.
+    pub ids: PixelGrid<u16>,
+    /// Pixels that several objects claimed.
+    pub disputed: u64,
+    /// Width and height of the source, of which the ids are the nearest pixels where the frame has another size.
+    pub size: (u32, u32),
 }
 
 /// The mask of a picture, drawn at its own size and brought to that of its frame by nearest neighbour. `ids` are those of
@@ -193,6 +169,50 @@ fn draw_pieces(
         }
     }
     Ok((grid, disputed.count()))
+}
+
+/// Refuses a size of another aspect than that of the frame.
+fn check_aspect(place: &Place, size: (u32, u32), frame: (u32, u32)) -> Result<(), Error> {
+    if size.0 > 0 && size.1 > 0 && same_aspect(size, frame) {
+        return Ok(());
+    }
+    Err(place.error(format!(
+        "{} x {} pixels, its frame has {} x {}: another aspect; export the masks at the size of the images or of their \
+         video",
+        size.0, size.1, frame.0, frame.1
+    )))
+}
+
+/// Most pixels of a source for one of its frame: captures are kept reduced by 8 at the most, along both sides.
+const MOST_PIXELS: u64 = 64;
+
+/// Refuses a size that a source only states, where drawing it would take far more memory than its frame.
+fn check_stated(place: &Place, size: (u32, u32), frame: (u32, u32)) -> Result<(), Error> {
+    let pixels = |(width, height): (u32, u32)| u64::from(width) * u64::from(height);
+    let most = pixels(frame).saturating_mul(MOST_PIXELS);
+    if pixels(size) <= most {
+        return Ok(());
+    }
+    Err(place.error(format!(
+        "it states {} x {} = {} pixels, more than {MOST_PIXELS} times the {} x {} of its frame ({most}); export the masks \
+         at the size of the images or of their video",
+        size.0,
+        size.1,
+        pixels(size),
+        frame.0,
+        frame.1
+    )))
+}
+
+/// Refuses a part of a picture that has another size.
+fn check_size(place: &Place, size: (u32, u32), picture: (u32, u32)) -> Result<(), Error> {
+    if size == picture {
+        return Ok(());
+    }
+    Err(place.error(format!(
+        "{} x {} pixels, other masks of its frame {} x {}; export them at one size",
+        size.0, size.1, picture.0, picture.1
+    )))
 }
 
 #[cfg(test)]

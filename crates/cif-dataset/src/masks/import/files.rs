@@ -4,10 +4,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use super::draw::{Content, Piece, Shape};
+use super::files_below::files_below;
 use super::frames::FrameNames;
-use super::mattes::Matte;
-use super::{Listing, Picture, Place, files_below};
+use super::picture::{Content, Listing, Matte, Picture, Piece, Place, Shape};
 use crate::Error;
 use crate::files::listing;
 

@@ -5,8 +5,9 @@ use std::path::Path;
 
 use serde_json::Value;
 
+use super::files_below::files_below;
 use super::frames::FrameNames;
-use super::{arrays, files, files_below, mattes};
+use super::{arrays, files, mattes};
 use crate::Error;
 use crate::files::{json, listing};
 

@@ -6,8 +6,8 @@ use std::path::Path;
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::draw::{Content, Piece, Shape};
-use super::{Listing, Picture, Place, polygon, runs};
+use super::picture::{Content, Listing, Picture, Piece, Place, Shape};
+use super::{polygon, runs};
 use crate::Error;
 use crate::files::{json, listing};
 

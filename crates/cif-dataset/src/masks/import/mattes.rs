@@ -1,25 +1,18 @@
 //! Mattes in EXR files, as Nuke and renderers write them: a channel per object, covered from one half on.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use cif_geometry::PixelGrid;
 use exr::meta::MetaData;
 use exr::prelude::{FlatSamples, ReadChannels, ReadLayers, Text, read as read_exr};
 
-use super::draw::{Content, Piece, Shape};
-use super::{Listing, Picture, Place, files_below};
+use super::files_below::files_below;
+use super::picture::{Content, Listing, Matte, Picture, Piece, Place, Shape};
 use crate::Error;
 use crate::files::exr_header;
 
 /// From this value on, a matte covers a pixel.
 const HALF: f32 = 0.5;
-
-/// A matte: a channel of an EXR file.
-pub(super) struct Matte {
-    pub(super) path: PathBuf,
-    /// Name of the channel with those of part and layer; `None` for the one of a file that holds a single matte.
-    pub(super) channel: Option<String>,
-}
 
 /// Names of channels that say nothing about an object.
 const COMPONENTS: [&str; 12] =

@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `kind` | which tool a file or folder comes from |
 //! | `frames` | which frame of the capture a picture of the source shows |
+//! | `picture` | what a source holds: objects, and pictures that show them |
 //! | `objects` | which objects there are, and which ids and labels they get |
 //! | `draw` | which object a pixel belongs to, where several claim it |
 //! | `coverage` | which pixels one object covers |
@@ -19,11 +20,13 @@ mod coverage;
 mod cvat;
 mod draw;
 mod files;
+mod files_below;
 mod frames;
 mod kind;
 mod label_studio;
 mod mattes;
 mod objects;
+mod picture;
 mod polygon;
 mod runs;
 #[cfg(test)]
@@ -31,63 +34,13 @@ mod tests;
 mod tracker;
 mod youtube_vis;
 
-use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use cif_geometry::PixelGrid;
-
-use self::draw::Content;
-use self::frames::{FrameNames, Task};
+pub use self::draw::Drawn;
+use self::frames::FrameNames;
 pub use self::kind::SourceKind;
-use self::objects::Objects;
-use crate::files::listing;
-use crate::load::same_aspect;
+use self::picture::Picture;
 use crate::{Dataset, Error, InstanceLabel};
-
-/// A picture of a source: a frame of the capture in the words of another tool.
-struct Picture {
-    /// Name of its frame, as the source has it: a path without ending, or a number.
-    name: String,
-    /// File, or entry of a file, for messages.
-    place: Place,
-    /// Width and height that the source states.
-    size: Option<(u32, u32)>,
-    content: Content,
-}
-
-/// A place in a source, for messages.
-#[derive(Clone, Debug, PartialEq, Eq)]
-struct Place {
-    file: PathBuf,
-    /// Entry of the file, such as `annotation 12`; empty where the file is all.
-    entry: String,
-}
-
-impl Place {
-    fn file(path: &Path) -> Self {
-        Self { file: path.to_owned(), entry: String::new() }
-    }
-
-    fn entry(path: &Path, entry: impl Into<String>) -> Self {
-        Self { file: path.to_owned(), entry: entry.into() }
-    }
-
-    /// An error at this place.
-    fn error(&self, problem: impl std::fmt::Display) -> Error {
-        let entry = if self.entry.is_empty() { String::new() } else { format!("{}: ", self.entry) };
-        Error::invalid(&self.file, format!("{entry}{problem}"))
-    }
-}
-
-/// What a reader lists of a source.
-#[derive(Default)]
-struct Listing {
-    objects: Objects,
-    pictures: Vec<Picture>,
-    /// The frames of a video that numbers of pictures count, where they are not all of them.
-    task: Option<Task>,
-    notes: Vec<String>,
-}
 
 /// Masks of another tool, listed and matched with the frames of a capture.
 pub struct Import {
@@ -101,16 +54,6 @@ pub struct Import {
     ids: Vec<u16>,
     /// Picture of every frame, `[frames]`.
     pictures: Vec<Option<Picture>>,
-}
-
-/// The mask of a frame.
-pub struct Drawn {
-    /// Id of every pixel, 0 for unlabelled, at the size of the frame.
-    pub ids: PixelGrid<u16>,
-    /// Pixels that several objects claimed.
-    pub disputed: u64,
-    /// Width and height of the source, of which the ids are the nearest pixels where the frame has another size.
-    pub size: (u32, u32),
 }
 
 impl Import {
@@ -201,83 +144,5 @@ impl Import {
         let frame = &dataset.frames[frame];
         let size = (frame.camera.width, frame.camera.height);
         draw::draw(picture, size, frame.turn, &self.ids).map(Some)
-    }
-}
-
-/// Refuses a size of another aspect than that of the frame.
-fn check_aspect(place: &Place, size: (u32, u32), frame: (u32, u32)) -> Result<(), Error> {
-    if size.0 > 0 && size.1 > 0 && same_aspect(size, frame) {
-        return Ok(());
-    }
-    Err(place.error(format!(
-        "{} x {} pixels, its frame has {} x {}: another aspect; export the masks at the size of the images or of their \
-         video",
-        size.0, size.1, frame.0, frame.1
-    )))
-}
-
-/// Most pixels of a source for one of its frame: captures are kept reduced by 8 at the most, along both sides.
-const MOST_PIXELS: u64 = 64;
-
-/// Refuses a size that a source only states, where drawing it would take far more memory than its frame.
-fn check_stated(place: &Place, size: (u32, u32), frame: (u32, u32)) -> Result<(), Error> {
-    let pixels = |(width, height): (u32, u32)| u64::from(width) * u64::from(height);
-    let most = pixels(frame).saturating_mul(MOST_PIXELS);
-    if pixels(size) <= most {
-        return Ok(());
-    }
-    Err(place.error(format!(
-        "it states {} x {} = {} pixels, more than {MOST_PIXELS} times the {} x {} of its frame ({most}); export the masks \
-         at the size of the images or of their video",
-        size.0,
-        size.1,
-        pixels(size),
-        frame.0,
-        frame.1
-    )))
-}
-
-/// Refuses a part of a picture that has another size.
-fn check_size(place: &Place, size: (u32, u32), picture: (u32, u32)) -> Result<(), Error> {
-    if size == picture {
-        return Ok(());
-    }
-    Err(place.error(format!(
-        "{} x {} pixels, other masks of its frame {} x {}; export them at one size",
-        size.0, size.1, picture.0, picture.1
-    )))
-}
-
-/// Files of a folder and its folders with one of these endings, by their path inside without ending, in order of names.
-fn files_below(folder: &Path, endings: &[&str]) -> Result<BTreeMap<String, PathBuf>, Error> {
-    let mut found = BTreeMap::new();
-    for path in listing::below(folder)?.into_iter().filter(|path| listing::has_extension(path, endings)) {
-        let inside = path.strip_prefix(folder).unwrap_or(&path).with_extension("");
-        let name = inside.to_string_lossy().replace('\\', "/");
-        if let Some(other) = found.insert(name, path.clone()) {
-            return Err(Error::invalid(
-                &path,
-                format!("{} has the same name; keep one of the two", other.display()),
-            ));
-        }
-    }
-    Ok(without_common_folder(found))
-}
-
-/// Names without the folders that all of them share, such as the name of the video.
-fn without_common_folder(mut files: BTreeMap<String, PathBuf>) -> BTreeMap<String, PathBuf> {
-    loop {
-        let Some(folder) =
-            files.keys().next().and_then(|name| name.split_once('/')).map(|(first, _)| format!("{first}/"))
-        else {
-            return files;
-        };
-        // One level is kept, since it may name an object or a camera.
-        let shared =
-            files.keys().all(|name| name.strip_prefix(&folder).is_some_and(|rest| rest.contains('/')));
-        if !shared {
-            return files;
-        }
-        files = files.into_iter().map(|(name, path)| (name[folder.len()..].to_owned(), path)).collect();
     }
 }

@@ -13,21 +13,13 @@ use png::ColorType;
 use rayon::prelude::*;
 use serde::Deserialize;
 
-use super::draw::Content;
-use super::{Listing, Picture, Place, files_below};
+use super::files_below::files_below;
+use super::picture::{Content, Listing, Picture, Place, Table};
 use crate::Error;
 use crate::files::{json, mask};
 
 /// A table of more colours than this is none.
 const MAX_COLORS: usize = 4096;
-
-/// What values and colours of the pictures stand for.
-pub(super) enum Table {
-    /// Objects by value.
-    Values(BTreeMap<u16, usize>),
-    /// Objects by colour.
-    Colors(BTreeMap<[u8; 3], usize>),
-}
 
 /// Objects by pixel.
 pub(super) fn decode(path: &Path, table: &Table) -> Result<PixelGrid<Option<usize>>, Error> {

@@ -8,9 +8,8 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use super::coco::{Category, is_without_mask, shape_of, text_of};
-use super::draw::{Content, Piece};
 use super::frames::FrameNames;
-use super::{Listing, Picture, Place};
+use super::picture::{Content, Listing, Picture, Piece, Place};
 use crate::Error;
 use crate::files::json;
 

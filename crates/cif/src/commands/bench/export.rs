@@ -20,7 +20,8 @@ use crate::report::Report;
 #[derive(Debug, Args)]
 #[command(after_help = "\
 The scene is built once per tolerance. Residuals are distances in world units: decisive is what the
-tolerance is held against (worst time, without the outermost 5 % of an object's weight). KB are the
+tolerance is held against (worst time, without the outermost 5 % of an object's weight); both are of
+motion that is fitted, and recorded poses, which leave as they are, have no residual. KB are the
 sampled values; write times and file sizes come with every format that this build can write, into a
 temporary folder. glTF holds few splats with paths of their own: what else is dense leaves as rigid parts there, and
 the lines of glTF tell what that misses (worst: largest decisive residual as a share of what is allowed).

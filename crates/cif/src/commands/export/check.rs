@@ -389,7 +389,7 @@ fn print_held_out(found: &HeldOutLoss, field: &Field) {
 fn advice(lost: Option<f64>) -> Option<String> {
     let lost = lost.filter(|lost| *lost > MUCH_DB)?;
     Some(format!(
-        "the file loses {lost:.2} dB: a smaller --tolerance keeps more of how objects move, a smaller \
+        "the file loses {lost:.2} dB: a smaller --tolerance keeps more of motion that is fitted, a smaller \
          --appearance-tolerance more of how they change; a .usda file holds a path for every splat, a .glb file those of \
          bodies and of the {LOOSE_SPLATS} splats that travel farthest, a .ply file one time"
     ))

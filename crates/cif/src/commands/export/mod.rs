@@ -33,9 +33,10 @@ use targets::{FILES, Targets, Writing};
     group = ArgGroup::new("result").required(true).multiple(true)
         .args(FORMATS.iter().map(|format| format.about().key).chain([FILES, "report", "json"])),
     after_help = "\
-Every object gets the cheapest motion that stays inside the tolerance: static, rigid, parts (a few
-rigid bodies), or dense (a path for every splat). Samples that interpolation reproduces inside the
-tolerance are left out. The table tells which motion was chosen, and what it misses.
+Poses that the scene records for an object, trained or imported, leave as they are, whatever the
+tolerance. Every other object gets the cheapest motion that stays inside the tolerance: static, rigid,
+parts (a few rigid bodies), or dense (a path for every splat), without the samples that interpolation
+reproduces inside the tolerance. The table tells which motion was chosen, and what it misses.
 
   cif export table.cif table.usda
   cif export table.cif table.usdz --tolerance 0.5%
@@ -63,7 +64,8 @@ pub(super) struct Export {
     preset: Option<Preset>,
     #[command(flatten)]
     writing: Writing,
-    /// Largest error of a simplified motion: 0.2% of the object's size, or 0.002 in world units
+    /// Largest error of a motion that is fitted, where no poses are recorded: 0.2% of the object's size, or 0.002 in
+    /// world units
     #[arg(long, default_value = "0.2%", value_name = "TOLERANCE")]
     tolerance: Tolerance,
     /// Largest RMS error of opacities and colours that change over time; 0 keeps them at every frame
