@@ -55,6 +55,7 @@ pub mod orientation;
 mod placement;
 mod points;
 mod summary;
+mod trained_images;
 
 /// Where a dataset lies in the coordinates of its capture.
 pub use cif_geometry::CaptureFrame;
@@ -70,3 +71,4 @@ pub use made_from::MadeFrom;
 pub use motion_truth::{MotionTruth, TrueMotion};
 pub use orientation::Turn;
 pub use summary::{CameraSummary, CaptureSummary, InstanceSummary, MaskSummary};
+pub use trained_images::TrainedImages;

@@ -74,7 +74,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::Arc;
 
-use cif_dataset::{Dataset, MadeFrom};
+use cif_dataset::{Dataset, MadeFrom, TrainedImages};
 use cif_field::Field;
 use cif_render::cpu::SimdLevel;
 use cif_render::{Gradients, UNLABELLED};
@@ -236,7 +236,7 @@ impl Trainer {
         Start { dataset, phases }: Start,
         measured_frames: MeasuredFrames,
         config: TrainConfig,
-        field: Field,
+        mut field: Field,
         progress: Option<Progress>,
     ) -> Result<Self, TrainError> {
         if let Some(tracks) = field.tracks.as_ref().filter(|tracks| !tracks.is_rigid()) {
@@ -275,6 +275,9 @@ impl Trainer {
             0.0 => field.record.drawing.near.unwrap_or_else(|| near::automatic(&dataset)),
             near => near,
         };
+        let inputs = resume::inputs_of(&dataset);
+        // Gaussians of another scene were trained on its images.
+        field.record.images.get_or_insert_with(|| serde_json::json!(TrainedImages::of(&dataset, &inputs)));
         let n = field.gaussians.len();
         let simd = SimdLevel::Auto;
         Ok(Self {
@@ -289,7 +292,7 @@ impl Trainer {
             instance_pass: InstancePass::On,
             saving: Saving::default(),
             measured_frames,
-            inputs: resume::inputs_of(&dataset),
+            inputs,
             pacing: None,
             messages,
             is_searched: false,
