@@ -86,9 +86,9 @@ pub enum Error {
     },
     /// A camera has no image.
     #[error(
-        "frame {frame}: {} names its camera, but the image {} is missing; restore the image or remove the \
+        "frame {frame}: {} names its camera, but the image {} is missing{}; restore the image or remove the \
          frame",
-        source_file.display(), image.display()
+        source_file.display(), image.display(), instead_of(image)
     )]
     CameraWithoutImage {
         /// Frame of the capture.
@@ -230,6 +230,20 @@ pub enum Error {
         /// The problem and what is expected.
         problem: String,
     },
+}
+
+/// A word on the image that may be meant by one that is missing: of the same name in capitals or with another ending.
+fn instead_of(image: &Path) -> String {
+    let plain = |path: &Path| path.file_stem().map(|stem| stem.to_string_lossy().to_lowercase());
+    let is_image = |path: &Path| {
+        let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase());
+        ending.is_some_and(|ending| ["png", "jpg", "jpeg"].contains(&ending.as_str()))
+    };
+    let Some(Ok(entries)) = image.parent().map(std::fs::read_dir) else { return String::new() };
+    let mut meant = entries.flatten().map(|entry| entry.path()).filter(|other| is_image(other));
+    let meant = meant.find(|other| plain(other) == plain(image));
+    let name = meant.as_deref().and_then(Path::file_name);
+    name.map_or_else(String::new, |name| format!(" (there is {})", name.to_string_lossy()))
 }
 
 impl Error {

@@ -57,6 +57,7 @@ mod points;
 mod recognition;
 mod sizes;
 mod summary;
+mod trained_images;
 
 /// Where a dataset lies in the coordinates of its capture.
 pub use cif_geometry::CaptureFrame;
@@ -73,3 +74,4 @@ pub use motion_truth::{MotionTruth, TrueMotion};
 pub use orientation::Turn;
 pub use sizes::same_aspect;
 pub use summary::{CameraSummary, CaptureSummary, InstanceSummary, MaskSummary};
+pub use trained_images::TrainedImages;

@@ -16,7 +16,7 @@ use serde_json::{Map, Value};
 use xxhash_rust::xxh3::{Xxh3, xxh3_128};
 
 use crate::files::listing;
-use crate::{Dataset, PointSource};
+use crate::{Dataset, Frame, PointSource};
 
 /// Bytes that are read at a time.
 const PIECE: usize = 1 << 18;
@@ -101,7 +101,7 @@ impl MadeFrom {
             let camera =
                 (&frame.camera, &frame.lens, frame.time, frame.split, &frame.group, &frame.camera_name);
             self.part(format!("the camera, time or split of frame {name}"), &camera);
-            files.push((format!("the image of frame {name}"), frame.image.clone()));
+            files.push((image_of(frame), frame.image.clone()));
             files.extend(frame.mask.clone().map(|mask| (format!("the mask of frame {name}"), mask)));
             let confidence = frame.confidence.clone();
             files
@@ -130,6 +130,13 @@ impl MadeFrom {
         let bare = |stamp: &Stamp| Stamp { content: stamp.content.clone(), seen: None };
         let inputs = self.inputs.iter().map(|(name, stamp)| (name.clone(), bare(stamp))).collect();
         Self { inputs, values: self.values.clone() }
+    }
+
+    /// The inputs whose names are `wanted`, and no values.
+    pub(crate) fn only(&self, wanted: impl Fn(&str) -> bool) -> Self {
+        let inputs = self.inputs.iter().filter(|(name, _)| wanted(name));
+        let inputs = inputs.map(|(name, stamp)| (name.clone(), stamp.clone())).collect();
+        Self { inputs, values: Map::new() }
     }
 
     fn part(&mut self, name: String, value: &impl Serialize) {
@@ -166,6 +173,11 @@ impl PartialEq for MadeFrom {
     fn eq(&self, other: &Self) -> bool {
         self.difference(other).is_none()
     }
+}
+
+/// The name of the image of a frame among inputs.
+pub(crate) fn image_of(frame: &Frame) -> String {
+    format!("the image of frame {}", frame.name)
 }
 
 /// Adds the values that differ, each by its keys.

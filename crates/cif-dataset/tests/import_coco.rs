@@ -64,6 +64,44 @@ fn boxes_without_a_mask_are_left_out_and_named() {
 }
 
 #[test]
+fn outlines_of_one_or_two_corners_cover_nothing() {
+    let folder = hypernerf(3);
+    let path = folder.path().join("coco.json");
+    let stroke = json!([3, 4, 5, 6]);
+    // Beside a true outline, and alone.
+    coco(&path, |v| {
+        v["annotations"][0]["segmentation"].as_array_mut().unwrap().insert(0, stroke.clone());
+        v["annotations"][2]["segmentation"] = json!([stroke, [1.5, 2]]);
+    });
+    let import = Import::open(&path, None, None, &open(&folder)).unwrap();
+    assert!(import.notes.iter().any(|note| note.starts_with("1 annotations") && note.ends_with(": 3")));
+    assert_eq!(imported(&folder, &path).2, [BOTH, Some([0, 0, 2]), BOTH]);
+}
+
+#[test]
+fn panoptic_coco_names_its_pictures() {
+    let folder = hypernerf(3);
+    let path = folder.path().join("coco.json");
+    coco(&path, |v| {
+        v["annotations"] =
+            json!([{"image_id": 10, "file_name": "0.png", "segments_info": [{"id": 1, "category_id": 7}]}]);
+    });
+    holds(&failure_of(&folder, &path), &["coco.json", "COCO panoptic", "give the folder of these"]);
+}
+
+#[test]
+fn names_that_roboflow_gave_are_those_of_before() {
+    let folder = hypernerf(3);
+    let path = folder.path().join("coco.json");
+    coco(&path, |v| {
+        for (k, image) in v["images"].as_array_mut().unwrap().iter_mut().enumerate() {
+            image["file_name"] = format!("{k:06}_jpg.rf.0123456789abcdef0123456789abcde{k}.jpg").into();
+        }
+    });
+    assert_eq!(imported(&folder, &path).2, [BOTH; 3]);
+}
+
+#[test]
 fn damaged_coco_is_refused_by_entry() {
     let folder = hypernerf(3);
     let path = folder.path().join("coco.json");

@@ -86,6 +86,55 @@ fn masks_of_single_objects_are_read_in_either_order() {
     }
 }
 
+#[test]
+fn pictures_in_one_folder_or_with_one_word_show_several_objects_by_their_values() {
+    for name in ["workspace/masks/{f}.png", "masks/{f}_mask.png", "masks/one/{f}.png"] {
+        let folder = hypernerf(3);
+        let source = folder.path().join("tracked");
+        for frame in 0..3 {
+            let inside = name.replace("{f}", &format!("{frame:06}"));
+            write_grey(&source.join(inside), |x, _| [0, 1, 2][object_at(x) as usize]);
+        }
+        let (kind, labels, frames) = imported(&folder, &source);
+        assert_eq!(kind, SourceKind::Tracker, "{name}");
+        assert_eq!(labels, ["instance_1", "instance_2"], "{name}");
+        assert_eq!(frames, [BOTH; 3], "{name}");
+    }
+    // One object is one all the same, called as its folder is.
+    let folder = hypernerf(3);
+    let source = folder.path().join("sam2");
+    for frame in 0..3 {
+        write_grey(&source.join(format!("4/{frame:05}.png")), |x, _| if object_at(x) == 1 { 255 } else { 0 });
+    }
+    let (kind, _, frames) = imported(&folder, &source);
+    assert_eq!((kind, frames[0]), (SourceKind::ObjectFolders, Some([4, 0, 0])));
+}
+
+#[test]
+fn arrays_of_truth_values_show_one_object() {
+    let folder = hypernerf(2);
+    let source = folder.path().join("arrays");
+    for frame in 0..2 {
+        let mut bytes = npy_header("|b1", &format!("({HEIGHT}, {WIDTH})"));
+        bytes.extend((0..WIDTH * HEIGHT).map(|at| u8::from(object_at(at % WIDTH) == 1)));
+        write(&source.join(format!("{frame:06}.npy")), bytes);
+    }
+    assert_eq!(imported(&folder, &source).2, [Some([1, 0, 0]); 2]);
+}
+
+#[test]
+fn files_without_masks_say_what_they_hold() {
+    let folder = hypernerf(1);
+    let path = folder.path().join("annotations.xml");
+    let image = "<image id=\"0\" name=\"000000.png\" width=\"32\" height=\"24\">";
+    let shapes = "<box label=\"a\"/><box label=\"b\"/><ellipse label=\"a\"/>";
+    write(&path, format!("<annotations>{image}{shapes}</image></annotations>"));
+    holds(&failure_of(&folder, &path), &["2 of kind box, 1 of kind ellipse", "draw masks or polygons"]);
+    let path = folder.path().join("000000.json");
+    write_json(&path, &json!({"version": "5.5.0", "shapes": [], "imagePath": "000000.png"}));
+    holds(&failure_of(&folder, &path), &["LabelMe", "COCO"]);
+}
+
 fn write_grey(path: &Path, value: impl Fn(u32, u32) -> u8) {
     std::fs::create_dir_all(path.parent().unwrap()).unwrap();
     image::GrayImage::from_fn(WIDTH, HEIGHT, |x, y| image::Luma([value(x, y)])).save(path).unwrap();

@@ -442,3 +442,64 @@ fn a_reconstruction_beside_a_nerfies_capture_gives_its_points_in_the_world_of_it
         std::fs::remove_dir_all(root.join("colmap")).unwrap();
     }
 }
+
+#[test]
+fn paths_of_windows_are_those_of_the_files() {
+    let folder = nerfstudio(4);
+    let dataset = open(&folder);
+    edit_json(&folder.path().join("transforms.json"), |value| {
+        for frame in value["frames"].as_array_mut().unwrap() {
+            let path = frame["file_path"].as_str().unwrap().replace('/', "\\");
+            frame["file_path"] = format!(".\\{path}").into();
+        }
+    });
+    let again = open(&folder);
+    let names = |dataset: &Dataset| dataset.frames.iter().map(|frame| frame.name.clone()).collect::<Vec<_>>();
+    assert_eq!(names(&again), names(&dataset));
+    assert_eq!(
+        again.frames[1].image.canonicalize().unwrap(),
+        dataset.frames[1].image.canonicalize().unwrap()
+    );
+}
+
+#[test]
+fn images_with_other_endings_than_colmap_saw_are_named() {
+    let folder = colmap_text(4);
+    let images = folder.path().join("images");
+    let first = std::fs::read_dir(&images).unwrap().map(|entry| entry.unwrap().path()).min().unwrap();
+    let renamed = first.with_extension("JPG");
+    std::fs::rename(&first, &renamed).unwrap();
+    let there = format!("(there is {})", renamed.file_name().unwrap().to_string_lossy());
+    holds(&failure(&folder), &["is missing", &there]);
+}
+
+#[test]
+fn models_whose_images_lie_in_the_whole_capture_are_read() {
+    let folder = colmap_text(4);
+    let expected = open(&folder);
+    let path = folder.path().join("sparse/0/images.txt");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let rows = text.lines().map(|line| match line.rsplit_once(' ') {
+        Some((row, name)) if name.ends_with(".png") => format!("{row} images/{name}"),
+        _ => line.to_owned(),
+    });
+    let rows: Vec<String> = rows.collect();
+    write(&path, rows.join("\n"));
+    let found = open(&folder);
+    assert_eq!(found.frames[2].name, expected.frames[2].name);
+    assert_eq!(found.frames[2].image, expected.frames[2].image);
+}
+
+#[test]
+fn camera_models_that_came_later_are_told_with_the_way_out() {
+    let folder = colmap_binary(4);
+    let path = folder.path().join("sparse/0/cameras.bin");
+    let mut bytes = std::fs::read(&path).unwrap();
+    // COLMAP's RAD_TAN_THIN_PRISM_FISHEYE, behind the number of cameras and the id of the first.
+    bytes[12..16].copy_from_slice(&11_u32.to_le_bytes());
+    write(&path, &bytes);
+    holds(
+        &failure(&folder),
+        &["cameras.bin", "camera model number 11 is not supported", "image_undistorter"],
+    );
+}

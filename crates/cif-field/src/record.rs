@@ -33,6 +33,8 @@ pub struct Record {
     pub run: Option<Run>,
     /// Settings of the run, for information and as the base of other runs.
     pub settings: Option<Value>,
+    /// Images that its Gaussians were trained on, as the trainer knows them again.
+    pub images: Option<Value>,
     /// Quality over the steps of the run, as the trainer measured it.
     pub curve: Option<Value>,
     /// Appearance of its instances, where a model has looked at them.
@@ -153,6 +155,7 @@ const CAPTURE: &str = "dataset";
 const IMPORTED: &str = "imported";
 const RUN: &str = "train";
 const SETTINGS: &str = "config";
+const IMAGES: &str = "images";
 const CURVE: &str = "curve";
 const EDITS: &str = "edits";
 const DRAWING: &str = "drawing";
@@ -199,6 +202,7 @@ impl Record {
         }
         record.run = take(&mut notes, RUN);
         record.settings = notes.remove(SETTINGS);
+        record.images = notes.remove(IMAGES);
         record.curve = notes.remove(CURVE);
         record.edits = take(&mut notes, EDITS).unwrap_or_default();
         if let Some(embeddings) = take::<Embeddings>(&mut notes, EMBEDDINGS) {
@@ -254,6 +258,7 @@ impl Record {
         let members = [
             (RUN, run),
             (SETTINGS, self.settings.clone()),
+            (IMAGES, self.images.clone()),
             (CURVE, self.curve.clone()),
             (EDITS, edits),
             (EMBEDDINGS, self.embeddings.as_ref().map(|embeddings| json!(embeddings))),

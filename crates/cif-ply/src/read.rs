@@ -26,7 +26,8 @@ const SCALE: usize = 4;
 const ROTATION: usize = 7;
 const COLOR: usize = 11;
 const REST: usize = 14;
-const SLOTS: usize = REST + 45;
+const FILTER: usize = REST + 45;
+const SLOTS: usize = FILTER + 1;
 
 /// Rows reserved before any is seen.
 const FIRST_ROWS: usize = 1 << 16;
@@ -49,7 +50,8 @@ impl PropertyAccess for Ignored {
 /// They become one still object that carries the file's name, occupied and certain of its identity, in the axes of the
 /// file, or as captured where we turned them; `rows` count the splats of the file. Splats far from the origin get one of
 /// their own in double precision, which [`SceneGraph::frame`] records. The comment `SplatRenderMode` says whether they are
-/// drawn antialiased.
+/// drawn antialiased, and `Vertical Axis` of other tools which axis points up. The smoothing filter of Mip-Splatting
+/// (`filter_3D`) becomes a part of sizes and opacities; the prefix that CloudCompare gives names (`scalar_`) does not count.
 ///
 /// # Errors
 /// No PLY, cut off, or without what a splat needs; the message says what is missing.
@@ -90,7 +92,8 @@ pub fn read(path: &Path) -> Result<SceneGraph, PlyError> {
         let mut warnings = columns.notes();
         let antialiased = render_mode(&header.comments, &mut warnings);
         let scene = collected.scene(path, (frame, turned(&header.comments)), warnings);
-        return assemble(Prims { antialiased, ..scene }).map_err(|error| invalid(error.to_string()));
+        let up_axis = vertical_axis(&header.comments).unwrap_or(scene.up_axis);
+        return assemble(Prims { antialiased, up_axis, ..scene }).map_err(|error| invalid(error.to_string()));
     }
     Err(invalid("it has no element `vertex`; splats are expected".to_owned()))
 }
@@ -104,6 +107,13 @@ fn is_ours(comments: &[String]) -> bool {
 fn turned(comments: &[String]) -> Option<UpAxis> {
     let mut ours = comments.iter().filter(|_| is_ours(comments));
     ours.find_map(|comment| comment.trim().strip_prefix(TURNED)?.trim().parse().ok())
+}
+
+/// The axis that points up, where the comment of nerfstudio or Brush tells it (`Vertical Axis: z`).
+fn vertical_axis(comments: &[String]) -> Option<UpAxis> {
+    let mut others = comments.iter().filter(|_| !is_ours(comments));
+    others
+        .find_map(|comment| comment.trim().to_lowercase().strip_prefix("vertical axis:")?.trim().parse().ok())
 }
 
 /// Where our comments place the scene in the world of its capture.
@@ -169,6 +179,8 @@ struct Columns {
     colors: Option<White>,
     /// True for splats with two scales.
     flat: bool,
+    /// True for splats with a smoothing filter of their own.
+    filtered: bool,
 }
 
 /// The value that is full light in a colour.
@@ -182,7 +194,8 @@ enum White {
 
 impl Columns {
     fn of(element: &ElementDef, encoding: Encoding) -> Result<Self, String> {
-        let has = |name: &str| element.properties.contains_key(name);
+        let names: Vec<&str> = element.properties.keys().map(|name| own_name(element, name)).collect();
+        let has = |name: &str| names.contains(&name);
         if has("packed_position") {
             return Err(
                 "its splats are packed (compressed PLY); unpack them, for example with: splat-transform in.compressed.ply out.ply"
@@ -196,7 +209,7 @@ impl Columns {
         let missing = |name: &&str| !has(name) && !replaced(name);
         let missing: Vec<&str> = required.into_iter().chain(numbered).filter(missing).collect();
         let flat = missing == ["scale_2"];
-        if missing.len() > 10 && has("x") {
+        if has("x") && numbered.iter().chain(&["opacity"]).all(|name| missing.contains(name)) {
             return Err(
                 "it is a point cloud without splats; scale_*, rot_*, opacity and f_dc_* are expected"
                     .to_owned(),
@@ -206,7 +219,7 @@ impl Columns {
             return Err(format!("its splats have no {}; export them whole", missing.join(", ")));
         }
         let rest = (0..).take_while(|k| has(&format!("f_rest_{k}"))).count();
-        let all = element.properties.keys().filter(|name| name.starts_with("f_rest_")).count();
+        let all = names.iter().filter(|name| name.starts_with("f_rest_")).count();
         let degree = match rest {
             0 => 0,
             9 => 1,
@@ -221,16 +234,16 @@ impl Columns {
         }
         let mut properties = Vec::new();
         let mut row_bytes = 0;
-        for (name, property) in &element.properties {
+        for (name, (_, property)) in names.iter().copied().zip(&element.properties) {
             let PropertyType::Scalar(scalar) = &property.data_type else {
                 return Err(format!("the property {name} of its splats is a list; remove it"));
             };
-            let color = || COLORS.iter().position(|color| color == name).map(|channel| COLOR + channel);
+            let color = || COLORS.iter().position(|color| *color == name).map(|channel| COLOR + channel);
             let slot = slot(name, rest).or_else(|| colors.and_then(|_| color()));
             properties.push((scalar.clone(), row_bytes, slot));
             row_bytes += scalar_size(scalar);
         }
-        Ok(Self { encoding, properties, row_bytes, degree, colors, flat })
+        Ok(Self { encoding, properties, row_bytes, degree, colors, flat, filtered: has("filter_3D") })
     }
 
     /// Sentences on what is not read as it stands.
@@ -240,7 +253,12 @@ impl Columns {
              along their third axis"
                 .to_owned()
         });
-        flat.into_iter().collect()
+        let filtered = self.filtered.then(|| {
+            "its splats have a smoothing filter, as those of Mip-Splatting (filter_3D): it was made a part of their sizes \
+             and opacities"
+                .to_owned()
+        });
+        flat.into_iter().chain(filtered).collect()
     }
 
     /// Splats, and how many could not be used.
@@ -309,6 +327,12 @@ fn white(element: &ElementDef) -> Option<White> {
     })
 }
 
+/// Name of a property without the prefix that CloudCompare gives those that it does not know, unless both are there.
+fn own_name<'a>(element: &ElementDef, name: &'a str) -> &'a str {
+    let bare = name.strip_prefix("scalar_").or_else(|| name.strip_prefix("scal_"));
+    bare.filter(|bare| !element.properties.contains_key(*bare)).unwrap_or(name)
+}
+
 /// Slot of a property; that of `f_rest_*` counts coefficients first and channels last, as ours do.
 fn slot(name: &str, rest: usize) -> Option<usize> {
     let numbered = |prefix: &str| name.strip_prefix(prefix)?.parse::<usize>().ok();
@@ -317,6 +341,7 @@ fn slot(name: &str, rest: usize) -> Option<usize> {
         "y" => return Some(POSITION + 1),
         "z" => return Some(POSITION + 2),
         "opacity" => return Some(OPACITY),
+        "filter_3D" => return Some(FILTER),
         _ => {}
     }
     if let Some(k) = numbered("scale_").filter(|k| *k < 3) {
@@ -373,6 +398,17 @@ fn smallest_size(element: &ElementDef, ascii: bool) -> u64 {
     bytes.saturating_sub(u64::from(ascii))
 }
 
+/// Standard deviations under an isotropic filter, and the share of the opacity that keeps what the splat covers in sum. Source:
+/// Mip-Splatting, section 4.1 (3D smoothing filter).
+fn filtered(scale: [f32; 3], filter: f32) -> ([f32; 3], f32) {
+    if filter == 0.0 {
+        return (scale, 1.0);
+    }
+    let wide = scale.map(|scale| f64::from(scale).hypot(f64::from(filter)));
+    let share: f64 = scale.iter().zip(wide).map(|(scale, wide)| f64::from(*scale) / wide).product();
+    (wide.map(|scale| scale as f32), share as f32)
+}
+
 /// Splats as they are collected, in post-activation form.
 struct Collected {
     /// Without centres.
@@ -400,16 +436,21 @@ impl Collected {
         let rotation = std::array::from_fn(|k| single[ROTATION + k]);
         let harmonics = &single[COLOR..COLOR + 3 * coefficient_count(splats.sh_degree)];
         let finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
-        let usable =
-            finite(&three(POSITION)) && finite(&scale) && finite(harmonics) && !single[OPACITY].is_nan();
+        let filter = single[FILTER];
+        let usable = finite(&three(POSITION))
+            && finite(&scale)
+            && finite(harmonics)
+            && !single[OPACITY].is_nan()
+            && (0.0..f32::MAX).contains(&filter);
         let Some(rotation) = quaternion::try_normalize(rotation).filter(|_| usable) else {
             self.left_out += 1;
             return;
         };
         self.centres.push([slots[POSITION], slots[POSITION + 1], slots[POSITION + 2]]);
         splats.orientations.push(rotation);
+        let (scale, share) = filtered(scale, filter);
         splats.scales.push(scale);
-        splats.opacities.push(direct_sigmoid(single[OPACITY]));
+        splats.opacities.push(direct_sigmoid(single[OPACITY]) * share);
         splats.sh_coefficients.extend_from_slice(harmonics);
         splats.occupancies.push(1.0);
         splats.identity_probabilities.push(1.0);

@@ -250,6 +250,7 @@ fn damaged_files_say_what_is_wrong() {
         (one("end_header\n", "end_header\n1 2 three\n"), "is not a number"),
         (one("property float rot_3", "property list uchar int rot_3"), "is a list"),
         (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n".to_vec(), "point cloud"),
+        (ascii(&splats, &["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]), "point cloud"),
         (b"ply\nformat ascii 1.0\nelement face 1\nproperty int a\nend_header\n3\n".to_vec(), "no element `vertex`"),
         (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty uint packed_position\nend_header\n1234".to_vec(), "packed"),
         (b"\x89PNG".to_vec(), "a.ply"),
@@ -403,6 +404,58 @@ fn flat_splats_are_read_and_written_as_flat_as_they_are() {
     let [a, b, c] = graph.nodes[0].splats.scales[0];
     assert!(a > 0.0 && b > 0.0 && c == 0.0);
     assert!(graph.warnings[0].contains("2D Gaussian Splatting"), "{:?}", graph.warnings);
+}
+
+#[test]
+fn smoothing_filters_are_a_part_of_sizes_and_opacities() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("mip.ply");
+    let names: Vec<&str> = PLAIN.into_iter().chain(["filter_3D"]).collect();
+    let row = |filter: f64| {
+        let mut row = plain([1.0, 2.0, 3.0], [0.1; 3]);
+        (row[3], row[4], row[5], row[6]) = (0.0, 0.3_f64.ln(), 0.4_f64.ln(), 1.2_f64.ln());
+        row.push(filter);
+        row
+    };
+    std::fs::write(&path, doubles(&[row(0.4), row(0.0)], &names)).unwrap();
+    let graph = read(&path).unwrap();
+    let splats = &graph.nodes[0].splats;
+    let close =
+        |found: f32, expected: f64| assert!((f64::from(found) - expected).abs() < 1e-6, "{found} {expected}");
+    // The roots of 0.3^2 + 0.4^2 and so on.
+    let wide = [0.5, 0.32_f64.sqrt(), 1.6_f64.sqrt()];
+    splats.scales[0].iter().zip(wide).for_each(|(found, expected)| close(*found, expected));
+    close(splats.opacities[0], 0.5 * 0.3 * 0.4 * 1.2 / wide.iter().product::<f64>());
+    close(splats.scales[1][0], 0.3);
+    close(splats.opacities[1], 0.5);
+    assert!(graph.warnings[0].contains("Mip-Splatting"), "{:?}", graph.warnings);
+}
+
+#[test]
+fn names_of_cloudcompare_and_the_axis_of_nerfstudio_and_brush_are_understood() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.ply");
+    let text = String::from_utf8(ascii(&splats(3, 1), &[])).unwrap();
+    std::fs::write(&path, &text).unwrap();
+    let expected = read(&path).unwrap();
+    assert_eq!(expected.up_axis, UpAxis::Z);
+    for prefix in ["scalar_", "scal_"] {
+        let renamed: Vec<String> = text
+            .lines()
+            .map(|line| match line.strip_prefix("property float ") {
+                Some(name) if !["x", "y", "z"].contains(&name) => format!("property float {prefix}{name}"),
+                _ => line.to_owned(),
+            })
+            .collect();
+        std::fs::write(&path, renamed.join("\n")).unwrap();
+        assert_eq!(read(&path).unwrap().nodes[0].splats, expected.nodes[0].splats, "{prefix}");
+    }
+    let head = "ply\nformat ascii 1.0\n";
+    for (comment, up) in [("Vertical Axis: z", UpAxis::Z), ("Vertical axis: y", UpAxis::Y)] {
+        std::fs::write(&path, text.replacen(head, &format!("{head}comment {comment}\n"), 1)).unwrap();
+        let graph = read(&path).unwrap();
+        assert_eq!((graph.up_axis, &graph.nodes[0].splats), (up, &expected.nodes[0].splats), "{comment}");
+    }
 }
 
 #[test]

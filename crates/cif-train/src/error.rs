@@ -181,7 +181,7 @@ pub enum TrainError {
         root: PathBuf,
     },
     /// The checkpoint belongs to this capture as it was.
-    #[error("{} is no longer what the run was trained on: {difference}", root.display())]
+    #[error("{} is no longer what the scene was trained on: {difference}", root.display())]
     ChangedCapture {
         /// The change, a sentence.
         difference: String,

@@ -81,10 +81,12 @@ pub enum UsdError {
         reason: String,
     },
     /// A stage without splats.
-    #[error("{path} holds no splats: no active ParticleField3DGaussianSplat prim with positions")]
+    #[error("{path} holds no splats: no active ParticleField3DGaussianSplat prim with positions{found}")]
     NoSplats {
         /// The stage.
         path: PathBuf,
+        /// Word on what it holds instead; may be empty.
+        found: String,
     },
     /// Something about a prim makes no sense.
     #[error("{path}: {prim}: {problem}; {fix}")]

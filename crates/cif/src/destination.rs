@@ -230,12 +230,17 @@ fn save_anew(checkpoint: &Checkpoint, path: &Path) -> Result<bool, Error> {
 
 /// Saves what its place refuses in the folder for temporary files.
 fn rescued(checkpoint: &Checkpoint, path: &Path, refused: &Error) -> Error {
-    match output::rescue_file(path).ok().filter(|rescue| checkpoint.save(rescue).is_ok()) {
-        Some(rescue) => Error::failed(
+    match output::rescue(path, |file| checkpoint.save(file).map_err(Error::plain)) {
+        Ok(rescue) => Error::failed(
             refused.to_string(),
             format!("the scene was saved as {} instead; move it where there is space", rescue.display()),
         ),
-        None => Error::failed(refused.to_string(), "make space, then train again"),
+        Err(error) => Error::failed(
+            format!(
+                "{refused}; nothing of this run could be saved in the folder for temporary files either: {error}"
+            ),
+            "make space, or set TMPDIR to a folder that has some, then train again",
+        ),
     }
 }
 

@@ -52,9 +52,24 @@ fn recognised(path: &Path) -> Option<&'static dyn SceneFormat> {
     FORMATS.into_iter().find(|format| format.recognises(path))
 }
 
+/// Endings of splats in formats that are not read, which a converter unpacks.
+const PACKED: [&str; 5] = ["spz", "splat", "ksplat", "sog", "lcc"];
+
 fn unknown_ending(path: &Path, known: &str) -> Error {
+    let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase()).unwrap_or_default();
+    let name = path.display();
+    if PACKED.contains(&ending.as_str()) {
+        let unpacked = path.with_extension("ply");
+        return Error::usage(
+            format!("{name}: files of splats that end in .{ending} are not read"),
+            format!(
+                "convert it, for example with: splat-transform {name} {}; or use {known}",
+                unpacked.display()
+            ),
+        );
+    }
     Error::usage(
-        format!("{}: the ending of the name tells the format, and this one is not known", path.display()),
+        format!("{name}: the ending of the name tells the format, and this one is not known"),
         format!("use {known}"),
     )
 }
@@ -169,7 +184,12 @@ mod tests {
             );
         }
         assert!(matches!(Content::of(Path::new("a.cif")), Ok(Content::Field)));
-        assert!(Content::of(Path::new("a.splat")).is_err());
+        for (name, ways) in
+            [("a.SPZ", ["splat-transform a.SPZ a.ply", ".glb"]), ("a.obj", ["not known", ".ply"])]
+        {
+            let told = Content::of(Path::new(name)).err().unwrap().with_help();
+            assert!(ways.iter().all(|way| told.contains(way)), "{told}");
+        }
         assert_eq!(endings(), ".usda, .usdc, .usdz, .usd (USD), .glb, .gltf (glTF) or .ply (PLY)");
     }
 }

@@ -224,15 +224,22 @@ pub fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Error> {
     cif_output::write(path, bytes).map_err(Error::io("write", path))
 }
 
-/// Creates an empty file in the folder for temporary files, for a scene that its own place refuses. Others may write
-/// into that folder: the name is random, and nothing that is there is followed or replaced.
+/// Saves what its own place refuses in the folder for temporary files. Others may write into that folder: the name is
+/// random, and nothing that is there is followed or replaced. A failure leaves nothing there.
 ///
 /// # Errors
 /// When that folder refuses it, too.
-pub fn rescue_file(path: &Path) -> io::Result<PathBuf> {
+pub fn rescue<E: From<Error>>(path: &Path, save: impl FnOnce(&Path) -> Result<(), E>) -> Result<PathBuf, E> {
+    let folder = std::env::temp_dir();
+    let refused = Error::io("write to", &folder);
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let file = tempfile::Builder::new().prefix("rescued-").suffix(&format!("-{name}")).tempfile()?;
-    file.into_temp_path().keep().map_err(|error| error.error)
+    let file = tempfile::Builder::new().prefix("rescued-").suffix(&format!("-{name}")).tempfile();
+    let file = match file {
+        Ok(file) => file.into_temp_path(),
+        Err(error) => return Err(refused(error).into()),
+    };
+    save(&file)?;
+    file.keep().map_err(|error| refused(error.error).into())
 }
 
 /// A file that is written piece by piece, to a temporary one in the same folder, which is removed when this is
@@ -353,12 +360,26 @@ mod tests {
 
     #[test]
     fn rescued_files_have_names_that_nobody_guesses() {
-        let [first, second] = [0, 1].map(|_| rescue_file(Path::new("far/table.cif")).unwrap());
+        let write = |path: &Path| fs::write(path, "a scene").map_err(Error::io("write", path));
+        let [first, second] = [0, 1].map(|_| rescue(Path::new("far/table.cif"), write).unwrap());
         let name = first.file_name().unwrap().to_string_lossy().into_owned();
         assert!(name.starts_with("rescued-") && name.ends_with("-table.cif"), "{name}");
         assert_ne!(first, second);
         for path in [first, second] {
+            assert_eq!(fs::read(&path).unwrap(), b"a scene");
             fs::remove_file(path).unwrap();
         }
+    }
+
+    #[test]
+    fn a_rescue_that_fails_leaves_nothing() {
+        let mut tried = PathBuf::new();
+        let full = rescue(Path::new("far/table.cif"), |path| {
+            assert!(path.is_file());
+            tried = path.to_owned();
+            Err(Error::plain("the disk is full"))
+        });
+        assert_eq!(full.unwrap_err().to_string(), "the disk is full");
+        assert!(!tried.as_os_str().is_empty() && !tried.exists());
     }
 }

@@ -411,6 +411,31 @@ fn instances_are_trained_on_the_reconstruction_of_another_scene() {
 }
 
 #[test]
+fn a_reconstruction_of_images_that_have_changed_is_not_begun_with_unasked() {
+    let folder = with_capture(6);
+    let path = folder.path();
+    cif(path, &format!("train table -o bare.cif --no-masks {TINY}")).succeeds();
+    // Other masks are what it is for; a copy of the capture is the same capture.
+    let copied = Command::new("cp").args(["-r", "table", "copy"]).current_dir(path).status();
+    assert!(copied.unwrap().success());
+    fs::rename(path.join("copy/masks/000000.png"), path.join("copy/masks/000001.png")).unwrap();
+    cif(path, "train copy -o other.cif --from bare.cif").succeeds();
+    let image = path.join("table/rgb/1x/000001.png");
+    let mut picture = image::open(&image).unwrap().into_rgb8();
+    picture.put_pixel(0, 0, image::Rgb([1, 2, 3]));
+    picture.save(&image).unwrap();
+    let line = "train table -o next.cif --from bare.cif";
+    let told = ["bare.cif", "the image of frame 000001 has changed", "without --from", "--accept-changes"];
+    cif(path, line).fails(1, &told);
+    // Of a scene that was itself begun so.
+    cif(path, "train table -o next.cif --from other.cif")
+        .fails(1, &["the image of frame 000001 has changed"]);
+    cif(path, &format!("{line} --accept-changes")).succeeds();
+    cif(path, "train table -o again.cif --from next.cif").succeeds();
+    cif(path, "train table -o none.cif --accept-changes").fails(2, &["--resume", "--from"]);
+}
+
+#[test]
 fn threads_do_not_change_the_scene() {
     let folder = with_capture(4);
     for threads in [1, 3] {

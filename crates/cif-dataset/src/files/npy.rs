@@ -167,7 +167,9 @@ fn parse<T: Copy>(
             .or_else(|file| values::<i16, _, _>(file, |v| into(v.into())))
             .or_else(|file| values::<u16, _, _>(file, |v| into(v.into())))
             .or_else(|file| values::<i8, _, _>(file, |v| into(v.into())))
-            .or_else(|file| values::<u8, _, _>(file, |v| into(v.into()))),
+            .or_else(|file| values::<u8, _, _>(file, |v| into(v.into())))
+            // Of one object: true is 1.
+            .or_else(|file| values::<bool, _, _>(file, |v| into(u8::from(v).into()))),
     };
     let values = values.unwrap_or_else(|file| {
         let expected = match elements {

@@ -76,11 +76,28 @@ pub(super) struct Intrinsics {
 /// # Errors
 /// When it does not parse or lists no frame.
 pub(super) fn read(path: &Path) -> Result<TransformsFile, Error> {
-    let file: TransformsFile = json::read(path)?;
+    let mut file: TransformsFile = json::read(path)?;
+    with_slashes(path.parent().unwrap_or(Path::new("")), &mut file);
     if file.frames.is_empty() {
         return Err(Error::invalid(path, "`frames` is empty; list the frames there"));
     }
     Ok(file)
+}
+
+/// Writes paths with `/` that a tool on Windows wrote with `\\`, unless such a file is there.
+fn with_slashes(root: &Path, file: &mut TransformsFile) {
+    let lists = [&mut file.train_filenames, &mut file.val_filenames, &mut file.test_filenames];
+    let listed = lists.into_iter().flatten().flatten();
+    let of_frames = file
+        .frames
+        .iter_mut()
+        .flat_map(|entry| std::iter::once(&mut entry.file_path).chain(&mut entry.mask_path));
+    for path in listed.chain(of_frames).chain(&mut file.ply_file_path) {
+        let text = path.to_string_lossy();
+        if text.contains('\\') && listing::with_image_extension(&root.join(&*path)).is_none() {
+            *path = PathBuf::from(text.replace('\\', "/"));
+        }
+    }
 }
 
 /// Cameras of a file by the paths of their images, with their times, and the file of points that it names.

@@ -1,13 +1,13 @@
 //! Runs that begin with the Gaussians and the deformation of a trained scene: other masks, or another variant
 //! of the instance stage, on one and the same reconstruction.
 
-use cif_dataset::{Dataset, Split};
+use cif_dataset::{Dataset, Split, TrainedImages};
 use cif_field::{Checkpoint, Field};
 use cif_geometry::PinholeCamera;
 use cif_geometry::scalar::logit;
 
 use super::evaluate::MeasuredFrames;
-use super::resume::{SavedState, restore};
+use super::resume::{SavedState, inputs_of, restore};
 use super::{Trainer, initialize};
 use crate::config::TrainConfig;
 use crate::error::TrainError;
@@ -34,7 +34,8 @@ impl Trainer {
     ///
     /// # Errors
     /// When a setting cannot work; when the scene is of other times, frames or cameras than the capture, does
-    /// not move, or is not reconstructed yet; when no training mask has a labelled pixel; when a frame cannot be
+    /// not move, or is not reconstructed yet; when images that it was trained on have changed since, unless
+    /// [`accept_changes`](crate::accept_changes) was asked; when no training mask has a labelled pixel; when a frame cannot be
     /// read; [`TrainError::Stopped`] when the stop of `start` was requested meanwhile.
     pub fn from_scene(
         start: impl Into<Start>,
@@ -105,8 +106,8 @@ impl Trainer {
     }
 }
 
-/// Refuses a capture that the scene was not trained on: masks, labels and image size may differ, what was
-/// seen from where and when may not.
+/// Refuses a capture that the scene was not trained on: masks, labels and the resolution of images may differ, what was
+/// seen, from where and when may not.
 fn check_capture(field: &Field, dataset: &Dataset) -> Result<(), TrainError> {
     let other = |what, expected: String, found: String| {
         Err(TrainError::OtherCapture { what, expected, found, root: dataset.root.clone() })
@@ -137,7 +138,14 @@ fn check_capture(field: &Field, dataset: &Dataset) -> Result<(), TrainError> {
             return other("the pose of a camera", at(&camera.camera), at(&frame.camera));
         }
     }
-    Ok(())
+    let trained = field.record.images.clone().and_then(|images| serde_json::from_value(images).ok());
+    let difference = trained.and_then(|trained: TrainedImages| {
+        trained.difference(&TrainedImages::of(dataset, &inputs_of(dataset)))
+    });
+    match difference {
+        Some(difference) => Err(TrainError::ChangedCapture { difference, root: dataset.root.clone() }),
+        None => Ok(()),
+    }
 }
 
 fn same_pose(a: &PinholeCamera, b: &PinholeCamera, extent: f64) -> bool {

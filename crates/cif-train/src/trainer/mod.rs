@@ -64,7 +64,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-use cif_dataset::{Dataset, MadeFrom};
+use cif_dataset::{Dataset, MadeFrom, TrainedImages};
 use cif_field::Field;
 use cif_render::cpu::SimdLevel;
 use cif_render::{Gradients, UNLABELLED};
@@ -216,7 +216,7 @@ impl Trainer {
         Start { dataset, phases }: Start,
         measured_frames: MeasuredFrames,
         config: TrainConfig,
-        field: Field,
+        mut field: Field,
         progress: Option<Progress>,
     ) -> Result<Self, TrainError> {
         if let Some(tracks) = field.tracks.as_ref().filter(|tracks| !tracks.is_rigid()) {
@@ -258,6 +258,9 @@ impl Trainer {
             0.0 => field.record.drawing.near.unwrap_or_else(|| near::automatic(&dataset)),
             near => near,
         };
+        let inputs = resume::inputs_of(&dataset);
+        // Gaussians of another scene were trained on its images.
+        field.record.images.get_or_insert_with(|| serde_json::json!(TrainedImages::of(&dataset, &inputs)));
         let n = field.gaussians.len();
         let simd = SimdLevel::Auto;
         Ok(Self {
@@ -273,7 +276,7 @@ impl Trainer {
             instance_pass: InstancePass::On,
             saving: Saving::default(),
             measured_frames,
-            inputs: resume::inputs_of(&dataset),
+            inputs,
             pacing: None,
             messages,
             saved_head: None,

@@ -65,6 +65,7 @@ impl Trainer {
                 })),
             }),
             settings: Some(json!(config)),
+            images: self.state.field.record.images.clone(),
             curve: (!progress.curve.points.is_empty()).then(|| json!(progress.curve)),
             // Of what training goes on with, nobody has looked at what it looks like now.
             embeddings: None,

@@ -141,9 +141,11 @@ pub(super) fn inputs_of(dataset: &Dataset) -> MadeFrom {
     MadeFrom::new().capture(dataset, None).by_content()
 }
 
-/// Lets a saved run go on with images, masks, cameras, points and labels that have changed since; frames, times, sizes and
-/// ids of instances must be the same all the same.
+/// Lets a saved run go on with images, masks, cameras, points and labels that have changed since, and a run begin with the
+/// Gaussians of a scene whose images have; frames, times and, of a saved run, sizes and ids of instances must be the
+/// same all the same.
 pub fn accept_changes(checkpoint: &mut Checkpoint) {
+    checkpoint.field.record.images = None;
     let capture = checkpoint.training.as_mut().and_then(|training| training.json.get_mut("capture"));
     if let Some(capture) = capture.and_then(Value::as_object_mut) {
         capture.remove("inputs");

@@ -1,7 +1,7 @@
 //! A stage as a scene graph.
 
 use std::cell::RefCell;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use cif_field::SortMetric;
@@ -91,6 +91,23 @@ pub(crate) fn scene(path: &Path, options: ReadOptions) -> Result<SceneGraph, Usd
     })
 }
 
+/// A word on what a stage without splats draws.
+fn what_else(stage: &Bound<'_, PyAny>) -> PyResult<String> {
+    /// Types that draw nothing by themselves.
+    const SILENT: [&str; 6] = ["", "Xform", "Scope", "Camera", "Material", "Shader"];
+    let mut types = BTreeSet::new();
+    for prim in stage.call_method0("Traverse")?.try_iter()? {
+        types.insert(prim?.call_method0("GetTypeName")?.str()?.to_string());
+    }
+    if types.iter().any(|name| name.starts_with("OmniNuRec")) {
+        return Ok("; its volumes are NuRec's, whose splats USD does not describe: export them as \
+                   ParticleField3DGaussianSplat, or as .ply"
+            .to_owned());
+    }
+    let drawn: Vec<&str> = types.iter().map(String::as_str).filter(|name| !SILENT.contains(name)).collect();
+    Ok(if drawn.is_empty() { String::new() } else { format!("; it has prims of type {}", drawn.join(", ")) })
+}
+
 fn read<'py>(
     reading: &Reading<'_, 'py>,
     stage: &Bound<'py, PyAny>,
@@ -99,7 +116,8 @@ fn read<'py>(
     let failed = |error: PyErr| reading.python(&error);
     let (owners, camera_prims) = survey(reading, stage).map_err(failed)?;
     if owners.is_empty() {
-        return Err(UsdError::NoSplats { path: reading.path.to_owned() });
+        let found = what_else(stage).map_err(failed)?;
+        return Err(UsdError::NoSplats { path: reading.path.to_owned(), found });
     }
     let prims: Vec<Prim> =
         owners.iter().map(|owner| nodes::read(reading, owner)).collect::<Result<_, _>>()?;

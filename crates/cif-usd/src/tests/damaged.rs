@@ -79,6 +79,15 @@ fn splats_that_make_no_sense_are_named() {
         ("splats.GetPositionsAttr().Clear()", "holds no splats"),
         ("prim.SetActive(False)", "holds no splats"),
         ("stage.RemovePrim('/World/Thing')", "holds no splats"),
+        (
+            "stage.RemovePrim('/World/Thing')\nstage.DefinePrim('/World/Ball', 'Sphere')",
+            "with positions; it has prims of type Sphere",
+        ),
+        (
+            "stage.RemovePrim('/World/Thing')\nstage.DefinePrim('/World/V', 'Volume')\n\
+             stage.DefinePrim('/World/V/density', 'OmniNuRecFieldAsset')",
+            "NuRec's, whose splats USD does not describe: export them as ParticleField3DGaussianSplat, or as .ply",
+        ),
         ("thing.AddScaleOp().Set(Gf.Vec3f(1, 0, 1))", "its transform flattens everything"),
         ("UsdGeom.SetStageMetersPerUnit(stage, 0)", "metersPerUnit is 0"),
         (

@@ -28,7 +28,11 @@ pub(super) fn read(folder: &Path) -> Result<Reconstruction, Error> {
         let model = cursor.u32()?;
         let size = [cursor.u64()? as f64, cursor.u64()? as f64];
         let &(name, count) = MODELS.get(model as usize).ok_or_else(|| {
-            Error::invalid(&cameras_path, format!("camera {id}: unknown camera model number {model}"))
+            let problem = format!(
+                "camera {id}: camera model number {model} is not supported; undistort the images with `colmap \
+                 image_undistorter`"
+            );
+            Error::invalid(&cameras_path, problem)
         })?;
         let params = (0..count).map(|_| cursor.f64()).collect::<Result<_, _>>()?;
         cameras.insert(id, Camera { model: name.to_owned(), size, params });

@@ -107,7 +107,14 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     }
     let mut frames = Vec::with_capacity(images.len());
     for image in images {
-        let relative = transforms::clean(Path::new(&image.name));
+        let mut relative = transforms::clean(Path::new(&image.name));
+        // COLMAP was given the whole capture as the folder of images.
+        if let Ok(inside) = relative.strip_prefix("images")
+            && !listing::is_there(&image_folder.join(&relative))
+            && listing::is_there(&image_folder.join(inside))
+        {
+            relative = inside.to_owned();
+        }
         let name = transforms::frame_name(&relative);
         let path = image_folder.join(&relative);
         if !listing::is_there(&path) {

@@ -46,6 +46,8 @@ struct Annotation {
     instance_id: Value,
     #[serde(default)]
     attributes: Value,
+    #[serde(default)]
+    segments_info: Value,
 }
 
 #[derive(Deserialize)]
@@ -65,6 +67,12 @@ pub(super) fn text_of(id: &Value) -> Option<String> {
 
 pub(super) fn list(source: &Path) -> Result<Listing, Error> {
     let file: File = json::read(source)?;
+    if file.annotations.iter().any(|annotation| annotation.segments_info.is_array()) {
+        return Err(Error::invalid(
+            source,
+            "its objects are in pictures (COCO panoptic), which this file only describes; give the folder of these",
+        ));
+    }
     let categories: BTreeMap<Option<String>, &str> =
         file.categories.iter().map(|category| (text_of(&category.id), category.name.as_str())).collect();
     let mut result = Listing::default();
@@ -78,7 +86,7 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
     let mut untracked = BTreeSet::new();
     let (mut boxes, mut boxed) = (Vec::new(), BTreeSet::new());
     for annotation in &file.annotations {
-        if is_without_mask(&annotation.segmentation) {
+        if covers_nothing(&annotation.segmentation) {
             boxes.push(annotation.id.to_string());
             boxed.extend(place_of.get(&text_of(&annotation.image_id)).copied());
             continue;
@@ -130,9 +138,15 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
     Ok(result)
 }
 
-/// True where there is a box at most.
-pub(super) fn is_without_mask(segmentation: &Value) -> bool {
-    segmentation.is_null() || segmentation.as_array().is_some_and(Vec::is_empty)
+/// True where there is a box at most, or outlines of one or two corners, as tools write of strokes that were drawn by mistake.
+pub(super) fn covers_nothing(segmentation: &Value) -> bool {
+    segmentation.is_null() || segmentation.as_array().is_some_and(|outlines| outlines.iter().all(is_stroke))
+}
+
+/// True for the corners of a point or a line.
+fn is_stroke(outline: &Value) -> bool {
+    let numbers = outline.as_array().map(Vec::len);
+    matches!(numbers, Some(2 | 4))
 }
 
 /// The note on annotations without a mask, of `all`.
@@ -145,12 +159,13 @@ pub(super) fn note_of_boxes(source: &Path, boxes: &[String], all: usize) -> Resu
     }
     if boxes.len() == all {
         let problem = format!(
-            "none of its {all} annotations has a segmentation, perhaps boxes only; export masks or polygons"
+            "none of its {all} annotations has a segmentation that covers anything, perhaps boxes only; export masks or \
+             polygons"
         );
         return Err(Error::invalid(source, problem));
     }
     Ok(Some(format!(
-        "{} annotations have no segmentation, perhaps boxes only, and were left out: {}",
+        "{} annotations have no segmentation that covers anything, perhaps boxes only, and were left out: {}",
         boxes.len(),
         some_of(boxes.iter().map(String::as_str))
     )))
@@ -167,7 +182,8 @@ pub(super) fn shape_of(segmentation: &Value) -> Result<Shape, String> {
                     serde_json::from_value(value.clone()).map_err(|_| EXPECTED.to_owned())?;
                 polygon::corners(&numbers)
             };
-            Ok(Shape::Polygons(outlines.iter().map(outline).collect::<Result<_, _>>()?))
+            let outlines = outlines.iter().filter(|outline| !is_stroke(outline));
+            Ok(Shape::Polygons(outlines.map(outline).collect::<Result<_, _>>()?))
         }
         Value::Object(code) => {
             let size: [u32; 2] = code

@@ -43,6 +43,17 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
         file.tracks(root, &tracks)?;
         file.result.task = task(root).map_err(|problem| Error::invalid(source, problem))?;
     }
+    let has_masks = file.result.pictures.iter().any(|picture| match &picture.content {
+        Content::Pieces(pieces) => !pieces.is_empty(),
+        _ => true,
+    });
+    if !has_masks && !file.left_out.is_empty() {
+        let shapes: Vec<String> =
+            file.left_out.iter().map(|(kind, count)| format!("{count} of kind {kind}")).collect();
+        let problem =
+            format!("none of its shapes are masks ({}); draw masks or polygons in CVAT", shapes.join(", "));
+        return Err(Error::invalid(source, problem));
+    }
     for (kind, count) in file.left_out {
         let note = format!("{count} shapes of kind {kind} are no masks and were left out");
         file.result.notes.push(note);

@@ -57,10 +57,10 @@ pub(super) fn order_of(names: &[&String], frames: &FrameNames) -> Result<Option<
     if first.0 + last.0 > 0 { of(first.0, last.0) } else { of(first.1, last.1) }
 }
 
-/// Whether names of `OBJECT.FRAME` are of one object.
-pub(super) fn one_object(names: &[&String]) -> bool {
+/// True where names in an order are of one object.
+pub(super) fn one_object(names: &[&String], order: Order) -> bool {
     let objects: BTreeSet<_> =
-        names.iter().map(|name| split(name, Order::ObjectThenFrame).map(|(_, object)| object)).collect();
+        names.iter().map(|name| split(name, order).map(|(_, object)| object)).collect();
     objects.len() == 1
 }
 

@@ -92,7 +92,9 @@ impl FrameNames {
     /// The frame of a name, which may have an ending of images.
     pub(super) fn whole(&self, name: &str) -> Option<usize> {
         let known = |name: &str| self.names.get(name).copied().flatten();
-        known(name).or_else(|| known(without_ending(name)))
+        let stem = without_ending(name);
+        let as_written = known(name).or_else(|| known(stem));
+        as_written.or_else(|| known(before_roboflow(stem)?)).or_else(|| known(stem.strip_suffix("_mask")?))
     }
 
     /// The frame of a name, also behind folders that the capture does not have.
@@ -310,6 +312,14 @@ impl FrameNames {
         let frames = numbers.iter().map(|number| Some((number - start) as usize)).collect();
         Some(Matched { frames, of_video: false, note: Some(note) })
     }
+}
+
+/// The name that a picture had before Roboflow called it `NAME_png.rf.0123456789abcdef0123456789abcdef`.
+fn before_roboflow(name: &str) -> Option<&str> {
+    let (before, hash) = name.rsplit_once(".rf.")?;
+    let (stem, ending) = before.rsplit_once('_')?;
+    let is_hash = hash.len() >= 16 && hash.bytes().all(|digit| digit.is_ascii_alphanumeric());
+    (is_hash && ENDINGS.iter().any(|known| ending.eq_ignore_ascii_case(known))).then_some(stem)
 }
 
 fn without_ending(name: &str) -> &str {

@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use super::files_below::files_below;
 use super::frames::FrameNames;
-use super::{arrays, files, mattes};
+use super::{arrays, files, mattes, tracker};
 use crate::Error;
 use crate::files::{json, listing};
 
@@ -93,6 +93,12 @@ fn of_json(source: &Path) -> Result<SourceKind, Error> {
     if value.as_array().is_some_and(|tasks| tasks.iter().any(|task| has(task, "annotations"))) {
         return Ok(SourceKind::LabelStudio);
     }
+    if has(&value, "shapes") && value.get("imagePath").is_some() {
+        return Err(Error::invalid(
+            source,
+            "LabelMe's file of one picture; convert all of them to one COCO file, as labelme2coco and X-AnyLabeling's export do",
+        ));
+    }
     Err(Error::invalid(
         source,
         "neither COCO (an object with images and annotations), YouTube-VIS (with videos and annotations), nor a JSON export \
@@ -150,13 +156,17 @@ fn of_folder(source: &Path, frames: &FrameNames) -> Result<SourceKind, Error> {
         return Ok(kind);
     }
     match files::order_of(&names, frames).map_err(invalid)? {
-        Some(files::Order::FrameThenObject) => Ok(SourceKind::FrameFolders),
-        // A name that all pictures begin with is that of the video, where values may tell objects apart.
-        Some(files::Order::ObjectThenFrame)
-            if kind == SourceKind::Tracker && single && files::one_object(&names) =>
+        // A name that all pictures begin with is that of the video, where values may tell objects apart; so is a folder of
+        // theirs, and a word behind all frames, where they do.
+        Some(order)
+            if kind == SourceKind::Tracker
+                && files::one_object(&names, order)
+                && (single && order == files::Order::ObjectThenFrame
+                    || tracker::has_several(pictures.values())?) =>
         {
             Ok(kind)
         }
+        Some(files::Order::FrameThenObject) => Ok(SourceKind::FrameFolders),
         Some(files::Order::ObjectThenFrame) => Ok(SourceKind::ObjectFolders),
         None => Ok(kind),
     }

@@ -66,6 +66,23 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
     Ok(listing)
 }
 
+/// True where some picture shows several objects by its values or colours.
+///
+/// # Errors
+/// When one cannot be read.
+pub(super) fn has_several<'a>(mut files: impl Iterator<Item = &'a PathBuf>) -> Result<bool, Error> {
+    let several = |path: &PathBuf| -> Result<bool, Error> {
+        if matches!(mask::color_type(path)?, ColorType::Rgb | ColorType::Rgba) {
+            return Ok(colors_of(path)?.keys().filter(|color| **color != [0; 3]).count() > 1);
+        }
+        let picture = mask::decode(path)?;
+        let mut shown = picture.pixels.iter().filter(|value| **value != 0);
+        let first = shown.next();
+        Ok(shown.any(|value| Some(value) != first))
+    };
+    files.try_fold(false, |found, path| Ok(found || several(path)?))
+}
+
 /// Ids of grey and palette pictures, which stay.
 fn values(
     files: &BTreeMap<String, PathBuf>,

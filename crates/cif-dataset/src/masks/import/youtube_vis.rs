@@ -7,7 +7,7 @@ use std::path::Path;
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::coco::{Category, is_without_mask, shape_of, text_of};
+use super::coco::{Category, covers_nothing, shape_of, text_of};
 use super::frames::FrameNames;
 use super::picture::{Content, Listing, Picture, Piece, Place};
 use crate::Error;
@@ -71,7 +71,7 @@ pub(super) fn list(source: &Path, frames: &FrameNames) -> Result<Listing, Error>
         let object = result.objects.enter(&key, category).map_err(|problem| place.error(problem))?;
         let seen = annotation.segmentations.iter().zip(&mut pieces).zip(&video.file_names);
         for ((segmentation, pieces), name) in
-            seen.filter(|((segmentation, _), _)| !is_without_mask(segmentation))
+            seen.filter(|((segmentation, _), _)| !covers_nothing(segmentation))
         {
             let place = Place::entry(source, format!("annotation {} in {name}", annotation.id));
             let shape = shape_of(segmentation).map_err(|problem| place.error(problem))?;

@@ -75,15 +75,17 @@ pub(super) struct Train {
     #[arg(long)]
     force: bool,
     /// Go on where SCENE.cif was interrupted; settings come from it
-    #[arg(long, conflicts_with_all = ["force", "preset", "config", "set"], conflicts_with = "settings")]
+    #[arg(long, conflicts_with_all = ["force", "preset", "config", "set"], conflicts_with = "settings",
+        group = "goes_on")]
     resume: bool,
-    /// Go on although images, masks, cameras, points or labels of the capture have changed since the run began
-    #[arg(long, requires = "resume")]
+    /// Go on although images, masks, cameras, points or labels of the capture have changed since the run began; with
+    /// --from, although its images have
+    #[arg(long, requires = "goes_on")]
     accept_changes: bool,
     /// Begin with the Gaussians and the motion of a trained scene of this capture: only identities and
     /// instances are trained
     #[arg(long, value_name = "SCENE.cif", conflicts_with_all = ["resume", "no_masks", "iterations_coarse",
-        "iterations_fine"])]
+        "iterations_fine"], group = "goes_on")]
     from: Option<PathBuf>,
     /// Stop after N steps of this command (at the next report, see report.step_every), saving so that
     /// --resume goes on
@@ -253,7 +255,10 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
         }
     });
     let _run = phases.enter(Phase::Other, 0);
-    let source = command.from.as_deref().map(load_source).transpose()?;
+    let mut source = command.from.as_deref().map(load_source).transpose()?;
+    if command.accept_changes {
+        source.iter_mut().for_each(cif_train::accept_changes);
+    }
     let base = source.as_ref().and_then(|source| cif_train::metrics::training_config(&source.field));
     let layout = command.capture_options.layout_after(&command.capture, |layout| match checkpoint {
         Some(_) => Ok(()),
@@ -321,10 +326,13 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
         TrainError::Stopped => {
             Error::Interrupted { message: "interrupted; nothing was saved".to_owned(), help: None }
         }
-        error @ TrainError::ChangedCapture { .. } => Error::failed(
-            format!("{}: {error}", command.output.display()),
-            "put it back; or train again with --force; or go on with what is there now: --accept-changes",
-        ),
+        error @ TrainError::ChangedCapture { .. } => {
+            let again = if command.from.is_some() { "without --from" } else { "again with --force" };
+            Error::failed(
+                format!("{}: {error}", command.from.as_ref().unwrap_or(&command.output).display()),
+                format!("put it back; or train {again}; or go on with what is there now: --accept-changes"),
+            )
+        }
         error => Error::plain(error),
     })?;
     trainer.set_simd(command.simd.into());
