@@ -138,6 +138,7 @@ impl Trainer {
                 }
             }
         }
+        self.send_messages(observer, requests);
         let next = self.stages.after(&self.state.config, stage);
         self.end_stage(stage, next, observer, requests)?;
         self.enter(next)?;
@@ -387,7 +388,7 @@ impl Trainer {
 
     /// Makes the field that the fine stage begins with, or leaves everything as it was when that fails or is stopped:
     /// the work of the stage of objects. Fits that were complete are kept all the same.
-    fn prepare_fine(&mut self) -> Result<(), TrainError> {
+    pub(super) fn prepare_fine(&mut self) -> Result<(), TrainError> {
         let before = self.state.keep();
         if let Err(error) = self.make_fine_field() {
             self.state.put_back(before);
