@@ -149,10 +149,8 @@ impl Trainer {
         if requests.stop || self.state.phases.is_stopped() {
             return Ok(Outcome::Interrupted);
         }
-        let seconds = self.state.config.report.checkpoint_seconds;
-        // A search that was short is as soon done again as saved.
-        let is_due = stage != Stage::Search || self.saving.is_due(seconds, self.now_s());
-        if seconds > 0 && is_due {
+        // What a long search found is saved with the first step, by time; a short one is as soon done again.
+        if self.state.config.report.checkpoint_seconds > 0 && stage != Stage::Search {
             self.count_stage_time();
             self.request_checkpoint(observer, requests);
         }
