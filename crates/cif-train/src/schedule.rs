@@ -507,22 +507,32 @@ mod tests {
 
     #[test]
     fn stages_follow_what_the_capture_has() {
-        let config = TrainConfig::default();
-        let walk = |plan: Stages| {
-            let mut stages = vec![plan.from(&config, Stage::Coarse)];
+        let walk = |plan: Stages, config: &TrainConfig| {
+            let mut stages = vec![plan.from(config, Stage::Search)];
             while stages[stages.len() - 1] != Stage::Done {
-                stages.push(plan.after(&config, stages[stages.len() - 1]));
+                stages.push(plan.after(config, stages[stages.len() - 1]));
             }
             stages
         };
-        use Stage::{Coarse, Done, Fine, Identity, Instance};
+        use Stage::{Coarse, Done, Fine, Identity, Instance, Objects, Search};
+        let mut config = TrainConfig::default();
+        let whole = Stages { is_dynamic: true, has_instances: true };
+        assert_eq!(walk(whole, &config), [Search, Coarse, Objects, Fine, Identity, Instance, Done]);
         assert_eq!(
-            walk(Stages { is_dynamic: true, has_instances: true }),
-            [Coarse, Fine, Identity, Instance, Done]
+            walk(Stages { has_instances: false, ..whole }, &config),
+            [Coarse, Fine, Done],
+            "without masks nothing is known of objects"
         );
-        assert_eq!(walk(Stages { is_dynamic: true, has_instances: false }), [Coarse, Fine, Done]);
-        let still = Stages { is_dynamic: false, has_instances: true };
-        assert_eq!(walk(still), [Fine, Identity, Instance, Done]);
+        let still = Stages { is_dynamic: false, ..whole };
+        assert_eq!(walk(still, &config), [Fine, Identity, Instance, Done]);
+        config.motion.guidance = 0.0;
+        assert_eq!(
+            walk(whole, &config),
+            [Coarse, Objects, Fine, Identity, Instance, Done],
+            "what rests is held"
+        );
+        config.motion.stillness = 0.0;
+        assert_eq!(walk(whole, &config), [Coarse, Fine, Identity, Instance, Done]);
         assert_eq!(still.iterations(&config, Fine), config.stages.coarse + config.stages.fine);
     }
 

@@ -124,6 +124,7 @@ fn hidden(scene: Scene, keeps_masks: bool) -> Vec<(f64, bool)> {
         ..told(gaussians)
     };
     trainer.state.objects.rigid.insert(3, Found::Moves(Box::new(fitted)));
+    trainer.prepare_fine().unwrap();
     trainer.enter(Stage::Fine).unwrap();
     trainer.state.field.validate().unwrap();
     let group = &trainer.state.field.tracks.as_ref().unwrap().groups[0];

@@ -138,6 +138,7 @@ impl Trainer {
                 }
             }
         }
+        self.send_messages(observer, requests);
         let next = self.stages.after(&self.state.config, stage);
         self.end_stage(stage, next, observer, requests)?;
         self.enter(next)?;
@@ -148,10 +149,8 @@ impl Trainer {
         if requests.stop || self.state.phases.is_stopped() {
             return Ok(Outcome::Interrupted);
         }
-        let seconds = self.state.config.report.checkpoint_seconds;
-        // A search that was short is as soon done again as saved.
-        let is_due = stage != Stage::Search || self.saving.is_due(seconds, self.now_s());
-        if seconds > 0 && is_due {
+        // What a long search found is saved with the first step, by time; a short one is as soon done again.
+        if self.state.config.report.checkpoint_seconds > 0 && stage != Stage::Search {
             self.count_stage_time();
             self.request_checkpoint(observer, requests);
         }
@@ -387,7 +386,7 @@ impl Trainer {
 
     /// Makes the field that the fine stage begins with, or leaves everything as it was when that fails or is stopped:
     /// the work of the stage of objects. Fits that were complete are kept all the same.
-    fn prepare_fine(&mut self) -> Result<(), TrainError> {
+    pub(super) fn prepare_fine(&mut self) -> Result<(), TrainError> {
         let before = self.state.keep();
         if let Err(error) = self.make_fine_field() {
             self.state.put_back(before);

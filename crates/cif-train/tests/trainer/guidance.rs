@@ -334,6 +334,7 @@ fn messages(dataset: &Dataset, config: &TrainConfig) -> Vec<String> {
             messages.push(message.clone());
             Control::Continue
         }
+        TrainEvent::StageStarted { stage: Stage::Search, .. } => Control::Continue,
         _ => Control::Stop,
     });
     assert_eq!(outcome.unwrap(), Outcome::Interrupted);
