@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import cif
@@ -117,6 +118,24 @@ def test_queries_stay_in_the_folder(tmp_path: Path, capfd: pytest.CaptureFixture
     assert "../library.usda" in said and "--follow-external" in said, said
     assert cif.run(["query", str(shot), "--label", "sedan", "--follow-external"]) == 0
     assert "/Hero" in capfd.readouterr().out
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the test locks as Unix does")
+@pytest.mark.parametrize("name", ["scene.cif", "scene.usda", "scene.glb", "scene.ply"])
+def test_files_wait_for_others_that_write_them(field: cif.Field, tmp_path: Path, name: str) -> None:
+    import fcntl
+
+    path = tmp_path / name
+    write = (lambda: field.save(path)) if name.endswith(".cif") else (lambda: field.export(path))
+    with (tmp_path / f".{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        writer = threading.Thread(target=write)
+        writer.start()
+        # Without waiting, it would be done by then.
+        writer.join(1.0)
+        assert writer.is_alive() and contents(tmp_path).keys() == {f".{name}.lock"}
+    writer.join()
+    assert path.stat().st_size > 0 and not (tmp_path / f".{name}.lock").exists()
 
 
 def test_motion_errors_stop_an_export(field: cif.Field, tmp_path: Path) -> None:
