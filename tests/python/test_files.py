@@ -120,6 +120,28 @@ def test_queries_stay_in_the_folder(tmp_path: Path, capfd: pytest.CaptureFixture
     assert "/Hero" in capfd.readouterr().out
 
 
+def test_messages_of_usd_are_shown_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    text = """#usda 1.0
+    def Xform "Car" (
+        prepend apiSchemas = ["SemanticsLabelsAPI:class"]
+        references = </Garage>
+    ) {
+        token[] semantics:labels:class = ["sedan"]
+    }
+    """
+    stage = tmp_path / "theirs.usda"
+    stage.write_text(text)
+    for _ in range(2):
+        cif.query_stage(stage, "sedan")
+        assert cif.run(["query", str(stage), "--label", "sedan"]) == 0
+    said = capfd.readouterr().err
+    (line,) = [line for line in said.splitlines() if "Unresolved reference" in line]
+    assert line.startswith("warning: USD: In </Car>") and "</Garage>" in line and "0x" not in line
+    (tmp_path / "other.usda").write_text(text)
+    cif.query_stage(tmp_path / "other.usda", "sedan")
+    assert "other.usda@</Garage>" in capfd.readouterr().err
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="the test locks as Unix does")
 @pytest.mark.parametrize("name", ["scene.cif", "scene.usda", "scene.glb", "scene.ply"])
 def test_files_wait_for_others_that_write_them(field: cif.Field, tmp_path: Path, name: str) -> None:
