@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import cif
@@ -117,6 +118,46 @@ def test_queries_stay_in_the_folder(tmp_path: Path, capfd: pytest.CaptureFixture
     assert "../library.usda" in said and "--follow-external" in said, said
     assert cif.run(["query", str(shot), "--label", "sedan", "--follow-external"]) == 0
     assert "/Hero" in capfd.readouterr().out
+
+
+def test_messages_of_usd_are_shown_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    text = """#usda 1.0
+    def Xform "Car" (
+        prepend apiSchemas = ["SemanticsLabelsAPI:class"]
+        references = </Garage>
+    ) {
+        token[] semantics:labels:class = ["sedan"]
+    }
+    """
+    stage = tmp_path / "theirs.usda"
+    stage.write_text(text)
+    for _ in range(2):
+        cif.query_stage(stage, "sedan")
+        assert cif.run(["query", str(stage), "--label", "sedan"]) == 0
+    said = capfd.readouterr().err
+    (line,) = [line for line in said.splitlines() if "Unresolved reference" in line]
+    assert line.startswith("warning: USD: In </Car>") and "</Garage>" in line and "0x" not in line
+    (tmp_path / "other.usda").write_text(text)
+    cif.query_stage(tmp_path / "other.usda", "sedan")
+    assert "other.usda@</Garage>" in capfd.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the test locks as Unix does")
+@pytest.mark.parametrize("name", ["scene.cif", "scene.usda", "scene.glb", "scene.ply"])
+def test_files_wait_for_others_that_write_them(field: cif.Field, tmp_path: Path, name: str) -> None:
+    import fcntl
+
+    path = tmp_path / name
+    write = (lambda: field.save(path)) if name.endswith(".cif") else (lambda: field.export(path))
+    with (tmp_path / f".{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        writer = threading.Thread(target=write)
+        writer.start()
+        # Without waiting, it would be done by then.
+        writer.join(1.0)
+        assert writer.is_alive() and contents(tmp_path).keys() == {f".{name}.lock"}
+    writer.join()
+    assert path.stat().st_size > 0 and not (tmp_path / f".{name}.lock").exists()
 
 
 def test_motion_errors_stop_an_export(field: cif.Field, tmp_path: Path) -> None:

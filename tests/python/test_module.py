@@ -57,6 +57,34 @@ def test_queries(field: cif.Field) -> None:
         field.find("teapot")
 
 
+LARGE = """
+import resource, sys
+import cif, numpy as np
+field = cif.Field.load(sys.argv[1])
+camera = field.cameras[0][2].resized(16384, 16384)
+points = np.zeros((50_000_000, 3))
+size = next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmSize"))
+resource.setrlimit(resource.RLIMIT_AS, ((size + 1_000_000) * 1024,) * 2)
+for work in [lambda: field.render(camera), lambda: field.show(camera), lambda: field.query(points)]:
+    try:
+        work()
+    except cif.CifError as error:
+        print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="free memory is known on Linux")
+def test_arrays_that_memory_does_not_hold_are_refused(field: cif.Field, tmp_path: Path) -> None:
+    field.save(tmp_path / "scene.cif")
+    command = [sys.executable, "-c", LARGE, str(tmp_path / "scene.cif")]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    render, show, query = run.stdout.splitlines()
+    assert "10.7 GB" in render and "16384 x 16384 pixels x 10 values x 4 bytes" in render
+    assert "4.3 GB" in show and "pixels x 4 values" in show
+    assert "1.2 GB" in query and "50000000 points x 3 instances x 8 bytes" in query
+
+
 def test_arrays_of_what_does_not_change_are_read_only(field: cif.Field) -> None:
     _, _, camera = field.cameras[0]
     named = ["means", "scales", "quaternions", "opacities", "occupancies", "sh_coefficients", "identities"]

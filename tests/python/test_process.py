@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -77,3 +78,48 @@ def test_packages_of_the_current_folder_are_not_imported(field: cif.Field, tmp_p
     done = subprocess.run([sys.executable, "-c", code], cwd=here, capture_output=True, text=True)
     assert done.stdout == f"{cif.usd_version()} 1\n", done
     assert not list(here.glob("*/ran"))
+
+
+MANIFEST = """
+[embedder]
+name = "any"
+size = 32
+
+[embedder.image]
+model = "picture.onnx"
+inputs = { image = "pixels" }
+outputs = { embedding = "embedding" }
+
+[embedder.text]
+model = "text.onnx"
+tokenizer = "words.json"
+inputs = { tokens = "ids" }
+outputs = { embedding = "embedding" }
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32" or not shutil.which("cc"), reason="no C compiler")
+def test_a_model_that_ends_the_runtime_ends_nothing_else(
+    field: cif.Field, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library = tmp_path / "library.so"
+    source = Path(__file__).parents[1] / "src" / "ending_runtime.c"
+    subprocess.run(["cc", "-shared", "-fPIC", source, "-o", library], check=True)
+    monkeypatch.setenv("ORT_DYLIB_PATH", str(library))
+    field.save(tmp_path / "scene.cif")
+    before = (tmp_path / "scene.cif").read_bytes()
+    models = tmp_path / "models"
+    models.mkdir()
+    (models / "models.toml").write_text(MANIFEST)
+    for name in ["picture.onnx", "text.onnx", "words.json"]:
+        (models / name).touch()
+    words = ["embed", str(tmp_path / "scene.cif"), "--capture", str(CAPTURE), "--models", str(models)]
+    # In this process, which goes on, and in one that is the command.
+    assert cif.run(words) == 1
+    here = capfd.readouterr().err
+    command = subprocess.run([sys.executable, "-m", "cif", *words], capture_output=True, text=True, check=False)
+    assert command.returncode == 1
+    for said in [here, command.stderr]:
+        assert said.count("Error") == 1 and "SIGABRT" in said, said
+        assert "picture.onnx cannot be loaded: it ended the process that ran it" in said, said
+    assert (tmp_path / "scene.cif").read_bytes() == before

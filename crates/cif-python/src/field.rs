@@ -6,13 +6,15 @@ use std::sync::OnceLock;
 use cif::lock::Lock;
 use cif::output;
 use cif_field::{Gaussians, RecordedCamera};
+use cif_geometry::PinholeCamera;
 use cif_geometry::scalar::sigmoid;
 use cif_geometry::spherical_harmonics::COEFFICIENTS;
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::{Channels, RenderSettings, RenderedImage};
 use cif_scene::{SceneGraph, SceneOptions};
+use cif_system::memory::Need;
 use glam::DVec3;
-use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArrayDyn};
+use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
@@ -59,10 +61,28 @@ impl Field {
         let settings = RenderSettings::of_field(&self.inner);
         let instances = channels.instances && self.inner.identities.is_some();
         let channels = Channels { instances, ..channels };
+        memory_of_view(camera, channels).check().map_err(cif_error)?;
         process::detach(py, || {
             Renderer::new(SimdLevel::Auto).render(&self.inner, &camera.inner, time, &settings, channels)
         })
     }
+}
+
+/// Memory of the arrays of a view.
+fn memory_of_view(camera: &Camera, channels: Channels) -> Need {
+    // Colour and alpha; depth; label, probability, coverage, foreground and entropy.
+    let values = 4 + u64::from(channels.depth) + 5 * u64::from(channels.instances);
+    let PinholeCamera { width, height, .. } = camera.inner;
+    Need {
+        bytes: 4 * values * u64::from(width) * u64::from(height),
+        arithmetic: format!("{width} x {height} pixels x {values} values x 4 bytes"),
+    }
+}
+
+/// Memory of the probabilities of every instance in each of some rows.
+fn memory_of_rows((rows, name): (usize, &str), instances: usize, item: usize) -> Need {
+    let bytes = (rows as u64).saturating_mul(instances as u64).saturating_mul(item as u64);
+    Need { bytes, arithmetic: format!("{rows} {name} x {instances} instances x {item} bytes") }
 }
 
 #[pymethods]
@@ -191,6 +211,7 @@ impl Field {
     fn identities<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArray2<f32>>>> {
         let Some(rows) = &self.inner.identities else { return Ok(None) };
         let instances = self.inner.instances.len();
+        memory_of_rows((rows.len(), "Gaussians"), instances, size_of::<f32>()).check().map_err(cif_error)?;
         let probabilities = rows.probabilities();
         let mut dense = vec![0.0_f32; rows.len() * instances];
         for row in 0..rows.len() {
@@ -303,10 +324,11 @@ impl Field {
         time: f64,
     ) -> PyResult<Bound<'py, PyDict>> {
         check_time(time)?;
+        let (count, instances) = (points.shape().first().copied().unwrap_or(0), self.inner.instances.len());
+        memory_of_rows((count, "points"), instances, size_of::<f64>()).check().map_err(cif_error)?;
         let points: Vec<DVec3> =
             arrays::rows::<f64, 3>("points", &points)?.into_iter().map(DVec3::from_array).collect();
         let answers = process::detach(py, || self.inner.query(&points, time))?;
-        let instances = self.inner.instances.len();
         let mut probabilities = vec![0.0_f64; answers.len() * instances];
         for (answer, row) in answers.iter().zip(probabilities.chunks_exact_mut(instances.max(1))) {
             for (label, probability) in &answer.identity {

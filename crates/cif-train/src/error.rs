@@ -23,6 +23,9 @@ pub enum TrainError {
         "settings under `model`: {0}; take a smaller spatial_resolution, fewer channels, or fewer or smaller multipliers"
     )]
     Memory(#[from] cif_system::memory::TooLittle),
+    /// Gaussians up to the limit of the settings take more memory than is free.
+    #[error("densify.max_gaussians: {0}; set a lower one")]
+    MemoryOfGaussians(cif_system::memory::TooLittle),
     /// The initial points are not usable.
     #[error("the initial points of the capture: {0}")]
     Points(#[from] cif_field::FieldError),

@@ -33,6 +33,8 @@ mod find;
 #[cfg(feature = "python")]
 mod layer;
 #[cfg(feature = "python")]
+mod messages;
+#[cfg(feature = "python")]
 mod primvars;
 #[cfg(feature = "python")]
 mod pxr;

@@ -6,6 +6,7 @@ use numpy::{PyArray1, PyArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList, PySlice};
 
+use crate::messages::Messages;
 use crate::{UsdError, conventions, tokens};
 
 /// The modules that stages are written and read with.
@@ -24,8 +25,12 @@ pub(crate) struct Pxr<'py> {
 
 /// Runs `body` with usd-core; attaches to the interpreter.
 pub(crate) fn with<T>(body: impl FnOnce(&Pxr<'_>) -> Result<T, UsdError>) -> Result<T, UsdError> {
-    Python::try_attach(|py| body(&without_current_folder(py, || Pxr::import(py))?))
-        .unwrap_or(Err(UsdError::NoInterpreter))
+    let attached = Python::try_attach(|py| {
+        let pxr = without_current_folder(py, || Pxr::import(py))?;
+        let _messages = Messages::of(&pxr.usd_utils);
+        body(&pxr)
+    });
+    attached.unwrap_or(Err(UsdError::NoInterpreter))
 }
 
 /// Imports modules of where packages are installed: relative entries of the search path, which are the current folder, are

@@ -90,8 +90,11 @@ impl Lock {
                 .and_then(|()| file.rewind())
                 .and_then(|()| file.write_all(holder.as_bytes()))
                 .and_then(|()| file.flush())
-                .map_err(Error::io("write the lock file", &path))
-                .map_err(Busy::Failed)?;
+                .map_err(|error| {
+                    // Of a full disk; nobody else has it.
+                    let _ = std::fs::remove_file(&path);
+                    Busy::Failed(Error::io("write the lock file", &path)(error))
+                })?;
             // Whoever held it before may have removed the file since it was opened.
             if std::fs::read_to_string(&path).is_ok_and(|now| now == holder) {
                 return Ok(Some(Self { _removed: Removed::new(path), _file: file }));

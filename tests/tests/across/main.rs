@@ -11,6 +11,7 @@ mod conventions;
 mod dependency_direction;
 mod determinism;
 mod edits;
+mod folders;
 mod gpu;
 mod hard_captures;
 mod hard_cases;

@@ -63,3 +63,18 @@ fn a_large_view_takes_the_memory_of_a_band() {
     assert_eq!(read("large/rgb/a.png").dimensions(), (2560, 2560));
     assert_eq!(read("large/instance/a.png").dimensions(), (2560, 2560));
 }
+
+#[test]
+fn depths_that_memory_does_not_hold_are_refused_before_they_are_drawn() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    write_scene(folder.path(), 16_384);
+    let line = format!(
+        "ulimit -v 1000000; exec {CIF} --threads 1 render scene.cif --camera views.json --backend cpu --what depth-color \
+         -o out"
+    );
+    let output =
+        Command::new("sh").args(["-c", &line]).current_dir(folder.path()).output().expect("sh starts");
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert!(told.contains("1.1 GB of memory (16384 x 16384 depths x 4 bytes)"), "{told}");
+    assert!(!folder.path().join("out").exists());
+}

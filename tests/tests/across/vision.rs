@@ -409,6 +409,47 @@ fn a_scene_is_asked_in_words() {
     run("env", path, ask).fails(1, &["ORT_DYLIB_PATH", "words.json", "no library"]);
 }
 
+/// Builds a library that ends the process; `None`, with a word, where there is no C compiler.
+#[cfg(unix)]
+fn ending_runtime(library: &Path, more: &[&str]) -> Option<()> {
+    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/src/ending_runtime.c");
+    let mut compiler = std::process::Command::new("cc");
+    compiler.args(["-shared", "-fPIC", source, "-o"]).arg(library).args(more);
+    let Ok(status) = compiler.status() else {
+        eprintln!("skipped: no C compiler");
+        return None;
+    };
+    assert!(status.success());
+    Some(())
+}
+
+#[cfg(unix)]
+#[test]
+fn a_model_that_ends_the_runtime_is_one_error_that_names_it() {
+    if !cif_vision::runtime::IS_BUILT {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    models::write(&path.join("models"));
+    let ask = |library: &str| {
+        let library = format!("ORT_DYLIB_PATH={}", path.join(library).display());
+        let embed = ["embed", "scene.cif", "--capture", "table", "--models", "models"];
+        run("env", path, [&[library.as_str(), CIF][..], &embed].concat())
+    };
+    if ending_runtime(&path.join("model.so"), &[]).is_none() {
+        return;
+    }
+    let told = ask("model.so");
+    assert_eq!(told.stderr.matches("Error").count(), 1, "{}", told.stderr);
+    told.fails(1, &["models/picture.onnx cannot be loaded", "ended the process that ran it", "SIGABRT"]);
+    // One that ends with the library itself is not blamed on the model.
+    ending_runtime(&path.join("library.so"), &["-DENDS_AT_ONCE"]);
+    let told = ask("library.so");
+    assert!(!told.stderr.contains("picture.onnx"), "{}", told.stderr);
+    told.fails(1, &["library.so is no library of ONNX Runtime that fits", "ended the process", "SIGABRT"]);
+}
+
 #[test]
 fn folders_without_models_are_refused() {
     let folder = tempfile::tempdir().unwrap();

@@ -1,6 +1,7 @@
 //! The field that a run starts from. Source: methods reference 1.1.
 
 use cif_dataset::{Dataset, Split};
+use cif_field::parameters::{Rows, TABLE};
 use cif_field::{Deformation, DeformationConfig, Field, Gaussians, Instance, RecordedCamera, Timeline};
 use cif_geometry::scalar::logit;
 use cif_system::memory::Need;
@@ -131,10 +132,23 @@ pub(super) fn deformation_shape(
     Ok(shape)
 }
 
+/// Copies of parameters in training: values, gradients and two moments.
+const COPIES: u64 = 4;
+
+/// Memory that so many Gaussians take in training.
+pub(super) fn memory_of_gaussians(count: u32) -> Need {
+    let of_gaussians = TABLE.iter().filter(|parameter| parameter.rows == Rows::Gaussians);
+    let floats: u64 = of_gaussians.map(|parameter| parameter.width() as u64).sum();
+    Need {
+        bytes: 4 * COPIES * floats * u64::from(count),
+        arithmetic: format!(
+            "{count} Gaussians x {floats} floats x {COPIES} copies (values, gradients, two moments) x 4 bytes"
+        ),
+    }
+}
+
 /// Memory that the planes of a deformation take in training.
 fn memory_of_planes(shape: &DeformationConfig) -> Need {
-    /// Copies in training: values, gradients and two moments.
-    const COPIES: u64 = 4;
     let floats = shape.plane_layout().1 as u64;
     let [x, y, z] = shape.spatial_resolution;
     Need {
@@ -164,6 +178,14 @@ fn initial_points(dataset: &Dataset, config: &TrainConfig) -> (Vec<[f32; 3]>, Ve
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn memory_of_gaussians_counts_their_copies() {
+        let need = memory_of_gaussians(1_000);
+        // Centre, scales, rotation, opacity, occupancy, 16 coefficients of three colours.
+        assert_eq!(need.bytes, 1_000 * (3 + 3 + 4 + 1 + 1 + 48) * 4 * 4);
+        assert!(need.arithmetic.starts_with("1000 Gaussians x 60 floats x 4 copies"), "{need:?}");
+    }
 
     #[test]
     fn memory_of_planes_counts_their_copies() {

@@ -49,7 +49,7 @@ impl Trainer {
     /// can be saved and resumed.
     ///
     /// # Errors
-    /// When a frame cannot be read, or too many steps in a row leave the finite numbers; the field then still is
+    /// When as many Gaussians as the settings allow do not fit into memory, a frame cannot be read, or too many steps in a row leave the finite numbers; the field then still is
     /// finite.
     pub fn run(&mut self, observer: &mut Observer<'_>) -> Result<Outcome, TrainError> {
         let phases = self.state.phases.clone();
@@ -66,6 +66,11 @@ impl Trainer {
         if let Some(saved) = &self.saved_head {
             let reason = format!("it trains the head {}; set it first", saved.name);
             return Err(TrainError::BadState { reason });
+        }
+        if !self.has_begun() && self.gpu_name().is_none() {
+            // GPUs have limits of their own.
+            let most = initialize::memory_of_gaussians(self.state.config.densify.max_gaussians);
+            most.check().map_err(TrainError::MemoryOfGaussians)?;
         }
         let mut requests = Requests::default();
         self.saving = Saving::begin(self.state.config.report.checkpoint_seconds, self.now_s());

@@ -34,3 +34,21 @@ fn a_frame_that_is_damaged_during_a_run_ends_it_by_name() {
     let error = trainer.run(&mut |_, _| Control::Continue).unwrap_err().to_string();
     assert!(error.contains(&*image.file_name().unwrap().to_string_lossy()), "{error}");
 }
+
+#[test]
+fn more_gaussians_than_memory_holds_are_refused_before_the_first_step() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 2, views: 2, ..Scene::default() });
+    let mut config = config(16);
+    config.densify.max_gaussians = u32::MAX;
+    let mut trainer = Trainer::new(dataset, config).unwrap();
+    if cif_system::memory::available().is_none() {
+        return;
+    }
+    let told = trainer.run(&mut |_, _| Control::Continue).unwrap_err().to_string();
+    assert!(
+        told.contains("densify.max_gaussians: it takes 4123.2 GB of memory (4294967295 Gaussians x 60"),
+        "{told}"
+    );
+    assert!(!trainer.has_begun());
+}

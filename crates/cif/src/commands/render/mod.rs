@@ -16,6 +16,7 @@ use cif_render::quality::{self, Quality};
 use cif_render::{Channels, RenderSettings, RenderedImage, screen_motion};
 use cif_scene::files::folder_of;
 use cif_scene::naming::instance_name;
+use cif_system::memory::Need;
 use cif_train::metrics::image::psnr;
 use cif_train::{Clock, SystemClock};
 use clap::{ArgGroup, Args, ValueEnum};
@@ -210,6 +211,9 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     outputs.reads(&command.scene)?;
     command.report.check(&mut outputs)?;
     let views = views(command, &field, &mut outputs)?;
+    if what.contains(&What::DepthColor) {
+        check_memory(&views)?;
+    }
     output::check_folder(&command.output, command.force)?;
     for Shot { view, .. } in &views {
         for what in &what {
@@ -270,6 +274,22 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
         what.iter().map(|what| what.folder()).chain(command.exr.then(|| EXR_FOLDER.to_owned())).collect();
     let report = report(&layers, &views, time_of_all, command, seconds)?;
     command.report.give(|| report, || {})
+}
+
+fn pixels(camera: &PinholeCamera) -> u64 {
+    u64::from(camera.width) * u64::from(camera.height)
+}
+
+/// Refuses views whose depths memory does not hold.
+fn check_memory(views: &[Shot]) -> Result<(), Error> {
+    let cameras = views.iter().map(|shot| &shot.view.camera);
+    let Some(camera) = cameras.max_by_key(|camera| pixels(camera)) else { return Ok(()) };
+    let PinholeCamera { width, height, .. } = camera;
+    let need = Need { bytes: 4 * pixels(camera), arithmetic: format!("{width} x {height} depths x 4 bytes") };
+    need.check().map_err(|error| {
+        let fix = "take smaller views, or depth, which needs no memory";
+        Error::failed(format!("depth-color: {error}"), fix)
+    })
 }
 
 /// Views with their times and files.
