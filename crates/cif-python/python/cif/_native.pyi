@@ -140,7 +140,7 @@ class UsdOptions(TypedDict, total=False):
     """Options of USD files."""
 
     payloads: Literal["by-kind", "separate", "single-file"]
-    """Where the arrays of objects go: beside the stage, into it, or (by-kind) beside .usda alone."""
+    """Where the arrays of objects go: next to the stage, into it, or (by-kind) next to .usda alone."""
     levels_of_detail: bool
     """Add variants with half and a quarter of the splats; on by default."""
     ground: Literal["none", "auto"] | dict[Literal["at"], float]
@@ -342,7 +342,7 @@ def train(
     """Train a field on a capture, and return it.
 
     dataset is an opened capture or its folder. With output, a .cif file, the run is saved there every five minutes,
-    at the end of each stage and in the end, its settings beside it; without, it is only returned.
+    at the end of each stage and in the end, its settings next to it; without, it is only returned.
 
     preset is "draft", "standard" (the default) or "paper"; effects says which effects are trained, "auto" (as the
     capture calls for), "all" or "none", then single ones on or off, as in "auto,-instances". settings are single
