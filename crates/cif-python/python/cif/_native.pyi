@@ -16,7 +16,7 @@ from typing_extensions import Unpack
 __version__: str
 
 class CifError(Exception):
-    """A file, capture, field or stage is not as it should be; the message names it and the way out."""
+    """A file, capture, field or stage is invalid; the message names it and the remedy."""
 
 class Camera:
     """A pinhole camera: x right, y down, z forward; the centre of the first pixel is (0.5, 0.5).
@@ -90,7 +90,7 @@ class Dataset:
     ) -> dict[str, NDArray[Any] | None]:
         """Load image, uint8 `[H, W, 3]`, and mask, uint16 `[H, W]` (None without one), of a frame.
 
-        What is transparent in the image shows the background.
+        Transparent pixels show the background.
         """
     def show(self, index: int = 0, *, what: Literal["rgb", "instance-color"] = "rgb") -> Picture:
         """Draw a frame as a picture, which notebooks show.
