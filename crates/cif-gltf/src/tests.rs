@@ -2,7 +2,9 @@
 
 use std::path::Path;
 
-use cif_scene::{CaptureFrame, Motion, MotionModel, NodeKind, PoseSample, SceneGraph, UpAxis, VisibilitySample};
+use cif_scene::{
+    CaptureFrame, Motion, MotionModel, NodeKind, PoseSample, SceneGraph, UpAxis, VisibilitySample,
+};
 use glam::{DMat3, DVec3};
 use proptest::prelude::*;
 use serde_json::{Value, json};

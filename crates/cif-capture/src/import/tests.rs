@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::Path;
 
+use cif_dataset::orientation::Orientation;
 use glam::DVec3;
 
 use super::*;

@@ -36,3 +36,17 @@ impl Motion {
         Self { trust: trust.collect(), back }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn flow_to_another_colour_is_not_trusted() {
+        // Flows that agree, over a pixel that changes its colour and one that keeps it.
+        let still = || Flow { u: Plane::filled(2, 1, 0.0), v: Plane::filled(2, 1, 0.0) };
+        let lab = |first: f32| [0; 3].map(|_| Plane { width: 2, height: 1, data: vec![first, 40.0] });
+        let trust = Motion::new(still(), &still(), &lab(90.0), &lab(40.0)).trust;
+        assert!(trust[0] < 0.05 && trust[1] > 0.99, "{trust:?}");
+    }
+}
