@@ -4,6 +4,7 @@
 use std::fs;
 use std::path::Path;
 
+use cif_system::environment::TEST_ONNX;
 use serde_json::json;
 
 use crate::onnx::{Attribute, Element, Model};
@@ -57,7 +58,7 @@ const CELL: i64 = 16;
 /// Under `require` where they cannot be run, and for other values.
 #[must_use]
 pub fn can_run() -> bool {
-    let wish = std::env::var("CIF_TEST_ONNX").unwrap_or_else(|_| "auto".to_owned());
+    let wish = TEST_ONNX.text().unwrap_or_else(|| "auto".to_owned());
     assert!(
         ["off", "auto", "require"].contains(&wish.as_str()),
         "CIF_TEST_ONNX is {wish}; it may be off, auto or require"

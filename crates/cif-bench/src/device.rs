@@ -1,10 +1,10 @@
-//! GPU times of the stages of a step, beside the least that they could take.
+//! GPU times of the stages of a step, compared with their least possible times.
 
 use std::time::Duration;
 
 use cif_render::wgpu::{DeviceSpeed, Gpu};
 use cif_train::wgpu::floors::{StepShape, floor};
-use serde_json::{Value, json};
+use serde::Serialize;
 
 use crate::Error;
 
@@ -31,6 +31,46 @@ struct StageRow {
     by_memory: bool,
 }
 
+/// Steps on a GPU, for programs.
+#[derive(Debug, Serialize)]
+pub struct DeviceReport<'a> {
+    /// Name of the GPU and of its interface.
+    name: &'a str,
+    /// How its subgroups are used, in words.
+    subgroups: &'a str,
+    /// Measured memory bandwidth, bytes per second.
+    bytes_per_second: f64,
+    /// Measured speed of arithmetic, operations per second.
+    flops_per_second: f64,
+    /// Stages of a step, in the order in which they ran; empty where the GPU has no timestamps.
+    stages: Vec<StageReport>,
+    /// Mean wall time of a step, milliseconds.
+    step_ms: f64,
+    /// The same on the processor, milliseconds.
+    processor_step_ms: f64,
+    /// The second over the first.
+    times_as_fast_as_processor: Option<f64>,
+}
+
+/// A stage on a GPU, mean of a step.
+#[derive(Debug, Serialize)]
+struct StageReport {
+    /// Name.
+    name: &'static str,
+    /// Time on the device, milliseconds.
+    ms: f64,
+    /// Least time that its bytes and operations could take, milliseconds.
+    floor_ms: f64,
+    /// The second over the first, in [0, 1].
+    share_of_floor: Option<f64>,
+    /// Bound that decides the floor: `memory`, `arithmetic` or `latency`.
+    floor_by: &'static str,
+    /// Least bytes that it moves.
+    bytes: f64,
+    /// Least floating-point operations that it does.
+    flops: f64,
+}
+
 impl OnDevice {
     /// From the stages of every measured step, what they worked on, and the mean wall time of a step here and on the
     /// processor.
@@ -48,35 +88,29 @@ impl OnDevice {
         })
     }
 
-    /// As JSON.
+    /// For programs.
     #[must_use]
-    pub fn json(&self) -> Value {
-        let stages: Vec<Value> = self
-            .stages
-            .iter()
-            .map(|row| {
-                json!({
-                    "name": row.name,
-                    "ms": row.ms,
-                    "floor_ms": row.floor_ms,
-                    "share_of_floor": row.share(),
-                    "floor_by": row.floor_by(),
-                    "bytes": row.bytes,
-                    "flops": row.flops,
-                })
-            })
-            .collect();
+    pub fn report(&self) -> DeviceReport<'_> {
+        let stage = |row: &StageRow| StageReport {
+            name: row.name,
+            ms: row.ms,
+            floor_ms: row.floor_ms,
+            share_of_floor: row.share(),
+            floor_by: row.floor_by(),
+            bytes: row.bytes,
+            flops: row.flops,
+        };
         let [here, processor] = self.step_ms;
-        json!({
-            "name": self.name,
-            "subgroups": self.subgroups,
-            "bytes_per_second": self.speed.bytes_per_second,
-            "flops_per_second": self.speed.flops_per_second,
-            "stages": stages,
-            "step_ms": here,
-            "processor_step_ms": processor,
-            "times_as_fast_as_processor": (here > 0.0).then(|| processor / here),
-        })
+        DeviceReport {
+            name: &self.name,
+            subgroups: &self.subgroups,
+            bytes_per_second: self.speed.bytes_per_second,
+            flops_per_second: self.speed.flops_per_second,
+            stages: self.stages.iter().map(stage).collect(),
+            step_ms: here,
+            processor_step_ms: processor,
+            times_as_fast_as_processor: (here > 0.0).then(|| processor / here),
+        }
     }
 
     /// As a table, with what it means.
@@ -184,7 +218,7 @@ mod tests {
         let rows = rows(&steps, &shape, &speed);
         assert_eq!(rows.iter().map(|row| row.name).collect::<Vec<_>>(), ["project", "accumulate", "judge"]);
         assert!((rows[0].ms - 3.0).abs() < 1e-9 && (rows[1].ms - 3.0).abs() < 1e-9);
-        // 120 kB at 100 MB/s, beside 220 kFLOP at 1 GFLOP/s.
+        // 120 kB at 100 MB/s, next to 220 kFLOP at 1 GFLOP/s.
         assert!((rows[0].floor_ms - 1.2).abs() < 1e-9 && rows[0].floor_by() == "memory");
         assert!((rows[0].share().unwrap() - 0.4).abs() < 1e-9);
         assert_eq!(rows[2].floor_by(), "latency");

@@ -1,4 +1,4 @@
-//! Captures changed in ways that must not matter, or must not break a run.
+//! Variants of captures whose changes must not matter, or must not break a run.
 
 use std::path::{Path, PathBuf};
 
@@ -12,9 +12,9 @@ use crate::Error;
 /// Loss of quality that a change may cost.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Demand {
-    /// Nothing: the same scene, told in another way.
+    /// Nothing: the same scene in another form.
     Same,
-    /// The run ends with a finite scene; what it costs is told.
+    /// The run ends with a finite scene; the loss is reported.
     Finite,
 }
 
@@ -38,7 +38,7 @@ impl std::fmt::Debug for HardCapture {
     }
 }
 
-/// Why a capture cannot be changed in a way.
+/// Reason why a capture has no such variant.
 #[derive(Debug)]
 pub enum Unfit {
     /// The capture lacks what is changed.
@@ -58,7 +58,8 @@ pub const HARD_CAPTURES: [HardCapture; 22] = [
     same("scaled-down", "lengths times 1e-3", true, |d, _| move_world(d, 1e-3, DMat3::IDENTITY, 0.0)),
     same("scaled-up", "lengths times 1e3", false, |d, _| move_world(d, 1e3, DMat3::IDENTITY, 0.0)),
     same("moved", "moved by 1e4 scene sizes", true, |d, _| move_world(d, 1.0, DMat3::IDENTITY, 1e4)),
-    // The planes of the deformation and their smoothness know the axes, so that this is told and not held to 0.
+    // The planes of the deformation and their smoothness know the axes, so that the change is reported and not held to
+    // 0.
     finite("axes-swapped", "x, y, z become y, z, x", false, |d, _| {
         move_world(d, 1.0, DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X), 0.0)
     }),

@@ -18,7 +18,7 @@ pub const MAX_MIOU_LOSS: f64 = 1.0;
 
 /// Result of a variant.
 #[derive(Clone, Debug, Default, Serialize)]
-pub struct Row {
+pub struct VariantScores {
     /// Name of the variant.
     pub name: &'static str,
     /// The change, in a few words.
@@ -43,7 +43,7 @@ pub struct Row {
     pub notes: Vec<String>,
 }
 
-impl Row {
+impl VariantScores {
     /// Compares it with the capture itself, which a change that must not matter matches.
     pub fn judge(&mut self, baseline: &Self, demand: Demand) {
         let change = |now: Option<f64>, before: Option<f64>| Some(now? - before?);
@@ -63,10 +63,10 @@ impl Row {
 
 /// Mean scores of runs that differ in their seed, with a note of their range; the rest is that of the first.
 #[must_use]
-pub fn mean_of(runs: &[Row]) -> Row {
+pub fn mean_of(runs: &[VariantScores]) -> VariantScores {
     let mut mean = runs[0].clone();
     let mut ranges = Vec::new();
-    let mut score = |name: &str, unit: &str, of: fn(&Row) -> Option<f64>| {
+    let mut score = |name: &str, unit: &str, of: fn(&VariantScores) -> Option<f64>| {
         let values: Vec<f64> = runs.iter().filter_map(of).collect();
         if values.is_empty() {
             return None;
@@ -81,7 +81,7 @@ pub fn mean_of(runs: &[Row]) -> Row {
 }
 
 /// Trains and scores one capture; whatever goes wrong is noted.
-pub fn measure(row: &mut Row, dataset: &Dataset, config: &TrainConfig, stop: &Stop) {
+pub fn measure(row: &mut VariantScores, dataset: &Dataset, config: &TrainConfig, stop: &Stop) {
     let start = Instant::now();
     // A panic is a finding here, not an end.
     let result = catch_unwind(AssertUnwindSafe(|| train_and_score(row, dataset, config, stop)));
@@ -100,7 +100,7 @@ pub fn measure(row: &mut Row, dataset: &Dataset, config: &TrainConfig, stop: &St
 }
 
 fn train_and_score(
-    row: &mut Row,
+    row: &mut VariantScores,
     dataset: &Dataset,
     config: &TrainConfig,
     stop: &Stop,
@@ -156,8 +156,12 @@ mod tests {
 
     #[test]
     fn the_capture_itself_is_the_mean_of_its_seeds() {
-        let run =
-            |psnr: f64, miou: Option<f64>| Row { psnr: Some(psnr), miou, gaussians: 7, ..Row::default() };
+        let run = |psnr: f64, miou: Option<f64>| VariantScores {
+            psnr: Some(psnr),
+            miou,
+            gaussians: 7,
+            ..VariantScores::default()
+        };
         let mean = mean_of(&[run(28.0, Some(96.0)), run(28.5, Some(97.5)), run(29.0, Some(96.0))]);
         assert_eq!((mean.psnr, mean.miou, mean.gaussians), (Some(28.5), Some(96.5), 7));
         assert_eq!(mean.notes, ["mean of 3 seeds: PSNR 28.00 to 29.00 dB, mIoU 96.00 to 97.50 %"]);

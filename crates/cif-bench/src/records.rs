@@ -17,7 +17,7 @@ pub trait Measurement: Serialize + DeserializeOwned {
     /// Everything that the measurement depends on: another value makes it void.
     fn fingerprint(&self) -> &MadeFrom;
 
-    /// Files that must lie beside the record of this name, without folder.
+    /// Files that must lie next to the record of this name, without folder.
     fn files(&self, id: &str) -> Vec<String>;
 }
 

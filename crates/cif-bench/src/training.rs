@@ -19,8 +19,8 @@ pub(crate) struct Run<'a> {
 }
 
 impl Run<'_> {
-    /// Trains, going on where it was interrupted with the same settings, else as `begin` says. `tell` gets the steps
-    /// done and all of them. `None` when `stop` says so.
+    /// Trains, going on where it was interrupted with the same settings, else as `begin` says. `progress` gets the
+    /// steps done and all of them. `None` when `stop` says so.
     ///
     /// # Errors
     /// When a setting cannot work, or training fails.
@@ -28,7 +28,7 @@ impl Run<'_> {
         &self,
         begin: &dyn Fn(Start) -> Result<Trainer, TrainError>,
         stop: &Stop,
-        tell: &mut dyn FnMut(u64, u64),
+        progress: &mut dyn FnMut(u64, u64),
     ) -> Result<Option<Trainer>, Error> {
         let begun = match self.partial.is_file() {
             true => Checkpoint::load(self.partial).ok(),
@@ -56,7 +56,7 @@ impl Run<'_> {
             }
             if let TrainEvent::Step { iteration, .. } = event {
                 stage.1 = *iteration;
-                tell(before + u64::from(done + stage.1 - stage.0), whole);
+                progress(before + u64::from(done + stage.1 - stage.0), whole);
             }
             if is_there { Control::Stop } else { Control::Continue }
         });

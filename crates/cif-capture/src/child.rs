@@ -32,11 +32,11 @@ impl<T> Answer<T> {
 /// How a program ended, as the predicate of a sentence.
 pub(crate) fn ending(status: ExitStatus) -> String {
     // `signal: 9 (SIGKILL)`, with `(core dumped)` where there is one.
-    let told = status.to_string();
-    match (status.code(), told.strip_prefix("signal: ")) {
+    let words = status.to_string();
+    match (status.code(), words.strip_prefix("signal: ")) {
         (Some(code), _) => format!("ended with exit code {code}"),
         (None, Some(signal)) => format!("was killed by signal {signal}"),
-        (None, None) => format!("ended: {told}"),
+        (None, None) => format!("ended: {words}"),
     }
 }
 
@@ -157,7 +157,7 @@ pub(crate) fn died(name: &str, status: ExitStatus, last_words: &str) -> Error {
     // Signal 9 on Linux is mostly the kernel's, for want of memory.
     Error::refused(
         format!("{name} {}{words}", ending(status)),
-        "try fewer or smaller images where memory may be short (signal 9); if it goes on, report it with these lines",
+        "try fewer or smaller images where memory may be short (signal 9); if it happens again, report it with these lines",
     )
 }
 

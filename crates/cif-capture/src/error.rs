@@ -1,7 +1,7 @@
-//! Errors of making captures: each names the file and the way out.
+//! Errors of making captures: each names the file and the remedy.
 
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// A capture could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -10,14 +10,9 @@ pub enum Error {
     /// A file of a capture could not be read or written.
     #[error(transparent)]
     Dataset(#[from] cif_dataset::Error),
-    /// Something about the input keeps a capture from being made.
-    #[error("{problem}")]
-    Refused {
-        /// The problem, naming the file.
-        problem: String,
-        /// Remedy.
-        fix: String,
-    },
+    /// The input prevents it, or the operating system does.
+    #[error(transparent)]
+    System(#[from] cif_system::Error),
     /// The images of a camera share nothing that moves, so that they show no depth.
     #[error("{problem}")]
     StandsStill {
@@ -25,16 +20,6 @@ pub enum Error {
         problem: String,
         /// Remedy.
         fix: String,
-    },
-    /// The file system refused.
-    #[error("cannot {action} {}: {source}", path.display())]
-    Io {
-        /// Action that failed, as in `read` or `write`.
-        action: &'static str,
-        /// File or folder.
-        path: PathBuf,
-        /// Error of the system.
-        source: io::Error,
     },
     /// The caller asked to stop.
     #[error("interrupted")]
@@ -44,7 +29,7 @@ pub enum Error {
 impl Error {
     /// A problem and its remedy.
     pub fn refused(problem: impl Into<String>, fix: impl Into<String>) -> Self {
-        Self::Refused { problem: problem.into(), fix: fix.into() }
+        cif_system::Error::refused(problem, fix).into()
     }
 
     /// A camera that stands still, and the remedy.
@@ -54,7 +39,7 @@ impl Error {
 
     /// Turns an error of the system into one that names the file.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
-        let path = path.to_owned();
-        move |source| Self::Io { action, path, source }
+        let named = cif_system::Error::io(action, path);
+        move |source| named(source).into()
     }
 }

@@ -1,5 +1,6 @@
 //! The metre from an object of known length that stands still and has masks.
 
+use cif_geometry::stats::upper_median;
 use glam::{DVec2, DVec3};
 
 use crate::frames::Shot;
@@ -85,15 +86,14 @@ pub fn measure(
         misses.push(miss(&poses.lenses[seen.pose.lens], seen.click.pixel, inside));
     }
     lengths.sort_by(f64::total_cmp);
-    misses.sort_by(f64::total_cmp);
-    let (Some(length), Some(missed)) = (lengths.get(lengths.len() * 9 / 10), misses.get(misses.len() / 2))
+    let (Some(length), Some(missed)) = (lengths.get(lengths.len() * 9 / 10), upper_median(&mut misses))
     else {
         return Err(Error::refused(
             "the object lies behind its cameras, so that it cannot be measured",
             "check the masks, or measure two points (--measured)",
         ));
     };
-    if *missed > MOVES * length {
+    if missed > MOVES * length {
         return Err(Error::refused(
             "the object moves, so that its distance is not known",
             "name an object that stands still, or measure two points of the scene (--measured)",

@@ -8,7 +8,7 @@
 //! | [`import`] | the same from files of other tools |
 //! | [`poses`] | lenses, poses and points |
 //! | [`similarity`] | similarity transforms, and how far two sets of poses are apart |
-//! | [`world`] | which way is up, and how long a metre is |
+//! | [`world`] | the direction of up, and the length of a metre |
 //! | [`known_length`] | the same from an object of known length |
 //! | [`masks`] | what moves, and is left out |
 //! | [`times`] | tables of times by file name |
@@ -62,7 +62,7 @@ impl Hooks<'_> {
         Self { should_stop: &|| false, progress: &|_| () }
     }
 
-    fn tell(&self, words: &str) {
+    fn say(&self, words: &str) {
         (self.progress)(Progress { words, count: None });
     }
 

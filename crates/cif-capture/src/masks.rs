@@ -36,7 +36,7 @@ impl Masks {
         Ok(Some(cif_dataset::masks::read_ids_at(path, &shot.file, shot.size, Turn::upright(shot.turned))?))
     }
 
-    /// The file of labels: in the folder of masks, else beside it, as captures have it.
+    /// The file of labels: in the folder of masks, else next to it, as captures have it.
     #[must_use]
     pub fn labels(&self) -> Option<PathBuf> {
         let beside = cif_output::folder_of(&self.folder);
@@ -74,7 +74,7 @@ pub fn find(folder: &Path, shots: &[Shot]) -> Result<Masks, Error> {
         };
         return Err(Error::refused(
             problem,
-            format!("masks are PNG files of ids, 0 for what is not labelled, named as the images: {example}"),
+            format!("masks are PNG files of ids, 0 for unlabelled, named as the images: {example}"),
         ));
     }
     Ok(Masks { folder: folder.to_owned(), files })
@@ -214,8 +214,8 @@ mod tests {
         image::GrayImage::new(24, 32).save(folder.path().join("000002.png")).unwrap();
         let shots = every_other();
         let masks = find(folder.path(), &shots).unwrap();
-        let told = masks.ids(&shots[1]).unwrap_err().to_string();
-        assert!(told.contains("24 x 32") && told.contains("32 x 24"), "{told}");
+        let message = masks.ids(&shots[1]).unwrap_err().to_string();
+        assert!(message.contains("24 x 32") && message.contains("32 x 24"), "{message}");
     }
 
     #[test]

@@ -4,6 +4,7 @@ use std::io::{self, BufReader, BufWriter};
 use std::path::Path;
 
 use cif_dataset::orientation::Orientation;
+use cif_geometry::stats::upper_median;
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
 use image::{DynamicImage, ImageDecoder, ImageEncoder, ImageFormat};
@@ -165,8 +166,7 @@ impl Impression {
     pub fn change(&self, other: &Self) -> f64 {
         let mut changes: Vec<f64> =
             self.blocks.iter().zip(&other.blocks).map(|(a, b)| (a - b).abs()).collect();
-        changes.sort_by(f64::total_cmp);
-        changes.get(changes.len() / 2).copied().unwrap_or(0.0)
+        upper_median(&mut changes).unwrap_or(0.0)
     }
 }
 

@@ -57,6 +57,13 @@ pub(crate) fn turned(
     })
 }
 
+/// Root mean square distance of places from their mean.
+pub(crate) fn spread(places: &[DVec3]) -> f64 {
+    let middle = places.iter().sum::<DVec3>() / places.len().max(1) as f64;
+    let sum: f64 = places.iter().map(|place| place.distance_squared(middle)).sum();
+    (sum / places.len().max(1) as f64).sqrt()
+}
+
 #[cfg(test)]
 mod tests {
     use glam::DVec2;
@@ -117,7 +124,7 @@ pub struct Pose {
     pub lens: usize,
     /// Camera to world; the camera looks along +z with x right and y down.
     pub world_from_camera: RigidTransform,
-    /// Points that tie the image to others; 0 where nothing tells.
+    /// Points that tie the image to others; 0 where that is not known.
     pub points: usize,
 }
 
@@ -145,7 +152,7 @@ pub struct Poses {
 
 impl Poses {
     /// Moves everything by a similarity: `x -> scale * rotation * x + translation`.
-    pub fn transform(&mut self, similarity: &crate::similarity::Similarity) {
+    pub fn transform(&mut self, similarity: &cif_geometry::Similarity) {
         for pose in self.images.values_mut() {
             pose.world_from_camera = similarity.camera(&pose.world_from_camera);
         }
@@ -159,6 +166,6 @@ impl Poses {
     pub fn spread(&self) -> f64 {
         let places: Vec<DVec3> =
             self.images.values().map(|pose| pose.world_from_camera.translation).collect();
-        crate::similarity::spread(&places)
+        spread(&places)
     }
 }

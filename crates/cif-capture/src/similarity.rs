@@ -2,17 +2,11 @@
 
 use cif_geometry::RigidTransform;
 pub use cif_geometry::Similarity;
+use cif_geometry::stats::upper_median;
 use cif_geometry::transform::angle_between;
 use glam::DVec3;
 
-use crate::poses::Poses;
-
-/// Root mean square distance of places from their mean.
-pub(crate) fn spread(places: &[DVec3]) -> f64 {
-    let middle = places.iter().sum::<DVec3>() / places.len().max(1) as f64;
-    let sum: f64 = places.iter().map(|place| place.distance_squared(middle)).sum();
-    (sum / places.len().max(1) as f64).sqrt()
-}
+use crate::poses::{Poses, spread};
 
 /// How far two sets of poses are apart once the best similarity is taken out.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -39,11 +33,10 @@ pub fn difference(a: &Poses, b: &Poses) -> Option<Difference> {
     let squares: f64 = from.iter().zip(&to).map(|(p, q)| similarity.apply(*p).distance_squared(*q)).sum();
     let mut angles: Vec<f64> =
         common.iter().map(|(p, q)| angle_between(&(similarity.rotation * p.rotation), &q.rotation)).collect();
-    angles.sort_by(f64::total_cmp);
     Some(Difference {
         images: common.len(),
         places: (squares / common.len() as f64).sqrt() / spread(&to),
-        median_angle: angles[angles.len() / 2],
+        median_angle: upper_median(&mut angles)?,
     })
 }
 

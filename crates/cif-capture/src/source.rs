@@ -186,9 +186,9 @@ mod tests {
         assert_eq!(names(&of(&[text("videos")]).unwrap()), [("one", None), ("two", None)]);
         let error = of(&[text("walk.mp4"), text("walk.mp4")]).unwrap_err().to_string();
         assert!(error.contains("another camera"), "{error}");
-        for (input, told) in [("none", "no such file"), ("photos/a.png", "one photograph")] {
+        for (input, expected) in [("none", "no such file"), ("photos/a.png", "one photograph")] {
             let error = of(&[text(input)]).unwrap_err().to_string();
-            assert!(error.contains(told), "{error}");
+            assert!(error.contains(expected), "{error}");
         }
         std::fs::create_dir(at("empty")).unwrap();
         assert!(of(&[text("empty")]).unwrap_err().to_string().contains("neither photographs"));

@@ -87,7 +87,7 @@ pub fn keep(
     }))
 }
 
-/// A name beside `place` at which nothing is.
+/// A name next to `place` at which nothing is.
 fn free(place: &Path) -> PathBuf {
     let numbered = |number: usize| {
         let mut name = place.as_os_str().to_owned();
@@ -97,7 +97,7 @@ fn free(place: &Path) -> PathBuf {
         }
         PathBuf::from(name)
     };
-    // Files of more tries than this would have been noticed; creating the folder then tells.
+    // Files of more tries than this would have been noticed; creating the folder then fails.
     (1..1000).map(numbered).find(|name| !name.exists()).unwrap_or_else(|| numbered(1000))
 }
 
@@ -168,10 +168,10 @@ mod tests {
             frames::collect(&again, &Choice::default(), folder.path(), &hooks, &mut notes).unwrap();
         let table = kept.times.unwrap();
         times::apply(&times::read(&table).unwrap(), &table, &mut found).unwrap();
-        let told = |shot: &Shot| {
+        let facts = |shot: &Shot| {
             (shot.name.clone(), shot.time, shot.source.clone(), std::fs::read(&shot.file).unwrap())
         };
-        assert_eq!(found.iter().map(told).collect::<Vec<_>>(), shots.iter().map(told).collect::<Vec<_>>());
+        assert_eq!(found.iter().map(facts).collect::<Vec<_>>(), shots.iter().map(facts).collect::<Vec<_>>());
         let kept = folder.path().join("table-unfinished");
         let read = import::read(&kept, &found).unwrap().matched(&kept, &mut found).unwrap().poses;
         assert_eq!(read.images, poses.images);

@@ -1,4 +1,4 @@
-//! Which way is up, and how long a metre is: poses from images alone tell neither.
+//! The direction of up and the length of a metre: poses from images alone give neither.
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -7,13 +7,13 @@ use crate::poses::Poses;
 use crate::similarity::Similarity;
 
 /// Cameras whose horizontal axes span a plane: the second largest share of their spread is at least this.
-/// Below it the axes are parallel, and tell only one direction in which up does not lie.
+/// Below it the axes are parallel, and exclude only one direction.
 const SPANS: f64 = 0.02;
 
 /// Cameras are held upright where the mean of their own up directions is at least this long along the estimate.
 const UPRIGHT: f64 = 0.3;
 
-/// The direction against gravity, told by the cameras: their rows of pixels are level, so that up is
+/// The direction against gravity, from the cameras: their rows of pixels are level, so that up is
 /// perpendicular to all of them; `None` where the cameras were not held so.
 #[must_use]
 pub fn up_of_cameras(poses: &Poses) -> Option<DVec3> {

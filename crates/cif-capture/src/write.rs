@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use cif_dataset::Turn;
 use cif_dataset::masks::{NewFolder, read_ids, read_ids_at, write_ids};
 use cif_geometry::Bounds;
+use cif_geometry::stats::upper_median;
 use serde_json::{Map, Value, json};
 
 use crate::frames::Shot;
@@ -22,7 +23,7 @@ pub struct Capture<'a> {
     pub shots: &'a [Shot],
     /// Poses, by name of the image.
     pub poses: &'a Poses,
-    /// Masks of ids, to be kept beside the images.
+    /// Masks of ids, to be kept next to the images.
     pub masks: Option<&'a Masks>,
     /// True where a unit of the poses is a metre.
     pub metres_known: bool,
@@ -174,8 +175,7 @@ fn frames_per_second(shots: &[Shot]) -> Option<f64> {
         .filter_map(|pair| Some(pair[1].time? - pair[0].time?))
         .filter(|distance| *distance > 1e-9)
         .collect();
-    distances.sort_by(f64::total_cmp);
-    let median = distances.get(distances.len() / 2)?;
+    let median = upper_median(&mut distances)?;
     Some((1e3 / median).round() / 1e3)
 }
 

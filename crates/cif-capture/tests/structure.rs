@@ -10,6 +10,7 @@ use cif_capture::structure::{self, Found, Lenses, Order, Request};
 use cif_capture::{Error, Hooks, Progress};
 use cif_dataset::{Dataset, OpenOptions, PointSource};
 use cif_geometry::{LensDistortion, RigidTransform};
+use cif_system::environment;
 use glam::{DMat3, DVec2, DVec3};
 
 const WIDTH: u32 = 240;
@@ -18,7 +19,7 @@ const FOCAL: f64 = 220.0;
 
 /// True where the Python that is taken has pycolmap.
 fn has_pycolmap() -> bool {
-    let python = std::env::var("CIF_PYTHON").unwrap_or_else(|_| "python3".to_owned());
+    let python = environment::PYTHON.text().unwrap_or_else(|| "python3".to_owned());
     let found = Command::new(python).args(["-c", "import pycolmap"]).output();
     let found = found.is_ok_and(|output| output.status.success());
     if !found {
@@ -374,7 +375,9 @@ fn pictures_that_do_not_overlap_have_no_poses() {
         });
         image.save(folder.path().join(format!("{k}.png"))).unwrap();
     }
-    let Err(Error::Refused { problem, fix }) = find(folder.path(), &shots(folder.path()), "work") else {
+    let Err(Error::System(cif_system::Error::Refused { problem, fix })) =
+        find(folder.path(), &shots(folder.path()), "work")
+    else {
         panic!("poses of nothing")
     };
     assert!(problem.contains("do not overlap") && fix.contains("two thirds"), "{problem} {fix}");

@@ -9,19 +9,11 @@ use exr::meta::attribute::SampleType;
 use exr::prelude::FlatSamples;
 
 use crate::color::{ColorEncoding, premultiplied};
+use crate::object::Object;
 use crate::{ExrError, cryptomatte};
 
 /// Depth where nothing is, as Blender has it: farther than anything.
 pub const NO_DEPTH: f32 = 1e10;
-
-/// An instance of the scene, by dense index.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Object {
-    /// Mask value.
-    pub id: u16,
-    /// Name in the Cryptomatte, unique.
-    pub name: String,
-}
 
 /// Description of a file apart from its pixels: name, time, size, units, background and objects of the frame.
 #[derive(Clone, Debug)]
@@ -154,7 +146,7 @@ pub(crate) fn attributes(frame: &Frame<'_>) -> Result<Vec<(String, String)>, Exr
     ));
     attributes.push((
         "cif/motion".to_owned(),
-        "forward: way to the next frame, pixels, u to the right, v up".to_owned(),
+        "forward: motion to the next frame, pixels, u to the right, v up".to_owned(),
     ));
     let next = frame.next.unwrap_or("none: the last frame");
     attributes.push(("cif/motionTo".to_owned(), next.to_owned()));

@@ -13,7 +13,7 @@
 //! |---|---|
 //! | `R`, `G`, `B`, `A` | colour of the splats, multiplied by alpha, without the background colour |
 //! | `Z` | expected depth along the viewing axis, world units; 1e10 where nothing is |
-//! | `forward.u`, `forward.v` | way to the next frame, pixels, u to the right, v up |
+//! | `forward.u`, `forward.v` | motion to the next frame, pixels, u to the right, v up |
 //! | `instance.id` | mask value of the instance that the pixel shows, 0 = none (32-bit integer) |
 //! | `coverage.V`, `foreground.V`, `probability.V`, `entropy.V` | instance layers as `cif render` has them |
 //! | `uCryptoObject00` ... `uCryptoObject02` | `.R .G .B .A`: id and coverage of the six foremost objects |
@@ -25,11 +25,13 @@ pub mod color;
 pub mod cryptomatte;
 mod error;
 pub mod layers;
+mod object;
 pub mod write;
 
 pub use color::ColorEncoding;
 pub use error::ExrError;
-pub use layers::{Frame, Object, Rows};
+pub use layers::{Frame, Rows};
+pub use object::Object;
 pub use write::{FrameWriter, write};
 
 #[cfg(test)]

@@ -14,8 +14,9 @@ use serde_json::{Value, json};
 use crate::arrays::Array;
 use crate::document::{self, Document};
 use crate::extras::{self, Cif, Extras};
+use crate::names::GENERATOR;
 use crate::rotation_keys::{self, Inserted, SamplerExtras};
-use crate::{EXTENSION, GENERATOR, GltfError, POINTER, VISIBILITY, conventions, loose};
+use crate::{EXTENSION, GltfError, POINTER, VISIBILITY, conventions, loose};
 
 /// A document and the arrays that follow each other in its only buffer.
 pub(crate) struct Authored<'a> {
@@ -128,14 +129,14 @@ impl<'a> Author<'a> {
                     let rest =
                         PoseSample { time_code: 0.0, translation: part.pivot, rotation: DQuat::IDENTITY };
                     let first = part.track.first().unwrap_or(&rest);
-                    let told = extras::Part {
+                    let extras = extras::Part {
                         name: part.name.clone(),
                         part: position,
                         pivot: part.pivot.to_array(),
                         joint: part.joint,
                         range: motion.joint_range(position),
                     };
-                    let child = self.part((index, &name), (&node.splats, part.splats.clone()), first, told);
+                    let child = self.part((index, &name), (&node.splats, part.splats.clone()), first, extras);
                     self.pose_channels(child, &part.track, &node.name, error)?;
                 }
             }
@@ -143,14 +144,14 @@ impl<'a> Author<'a> {
                 let own = loose.ok_or_else(|| GltfError::Dense { node: node.name.clone() })?;
                 for splat in all {
                     let (track, sizes) = loose::path(motion, splat, own);
-                    let told = extras::Part {
+                    let extras = extras::Part {
                         name: format!("splat_{splat:03}"),
                         part: splat,
                         pivot: track[0].translation.to_array(),
                         joint: None,
                         range: None,
                     };
-                    let child = self.part((index, &name), (own, splat..splat + 1), &track[0], told);
+                    let child = self.part((index, &name), (own, splat..splat + 1), &track[0], extras);
                     self.pose_channels(child, &track, &node.name, error)?;
                     self.size_channel(child, &track, sizes, &node.name)?;
                 }
@@ -167,16 +168,16 @@ impl<'a> Author<'a> {
         (parent, of): (usize, &str),
         (splats, range): (&'a Splats, Range<usize>),
         first: &PoseSample,
-        told: extras::Part,
+        extras: extras::Part,
     ) -> usize {
-        let name = self.unique(&format!("{of}_{}", told.name));
+        let name = self.unique(&format!("{of}_{}", extras.name));
         let mesh = self.mesh(&name, splats, range);
         let child = self.push(document::Node {
             name,
             mesh,
             translation: Some(single(first.translation)),
             rotation: Some(conventions::gltf_quaternion(first.rotation)),
-            extras: Some(Extras { cif: Cif::Part(told) }),
+            extras: Some(Extras { cif: Cif::Part(extras) }),
             ..document::Node::default()
         });
         self.document.nodes[parent].children.push(child);

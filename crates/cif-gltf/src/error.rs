@@ -12,12 +12,14 @@ pub enum GltfError {
     #[error(transparent)]
     File(#[from] FileError),
     /// Not a file name of glTF.
-    #[error("{path}: the ending decides the kind of file; use .glb (one file) or .gltf (text beside a .bin)")]
+    #[error(
+        "{path}: the ending decides the kind of file; use .glb (one file) or .gltf (text next to a .bin)"
+    )]
     Extension {
         /// Given path.
         path: PathBuf,
     },
-    /// A folder is in the way.
+    /// A folder has the name of the file.
     #[error("{path} is a folder; give a file name")]
     IsFolder {
         /// The folder.

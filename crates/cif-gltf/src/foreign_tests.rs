@@ -11,7 +11,7 @@ use tempfile::TempDir;
 use crate::testing::Numbers;
 use crate::{EXTENSION, read_scene};
 
-/// A file in the making: JSON beside one buffer.
+/// A file in the making: JSON next to one buffer.
 struct File {
     json: Value,
     bytes: Vec<u8>,
@@ -418,8 +418,8 @@ fn buffers_beside_the_file_are_read_and_none_elsewhere() {
         ("data/../../secret.bin", "leaves the folder"),
         ("%2e%2e/secret.bin", "leaves the folder"),
         ("/etc/passwd", "leaves the folder"),
-        ("https://example.org/a.bin", "put that file beside this one"),
-        ("file:///etc/passwd", "put that file beside this one"),
+        ("https://example.org/a.bin", "put that file next to this one"),
+        ("file:///etc/passwd", "put that file next to this one"),
         ("absent.bin", "cannot be read"),
         ("data", "it is a folder"),
         ("short.bin", "cut off"),

@@ -32,6 +32,7 @@ mod extras;
 #[cfg(test)]
 mod foreign_tests;
 mod loose;
+mod names;
 mod read;
 mod relabel;
 mod rotation_keys;
@@ -43,37 +44,17 @@ mod write;
 
 use std::path::{Path, PathBuf};
 
-use cif_scene::{About, Ending, FormatError, MotionModel, ReadOptions, SceneGraph};
+use cif_scene::{About, Ending, FormatError, ReadOptions, SceneGraph};
 
 pub use cif_scene::format::{ExportOptions, ExportSummary, Relabelled, SceneFormat};
 pub use error::GltfError;
+pub use names::{
+    EXTENSION, IDENTITY, INSTANCE_IDS, INSTANCE_SHARES, MOST_EXPENSIVE_MOTION, OCCUPANCY, POINTER, ROW,
+    VISIBILITY,
+};
 pub use read::read_scene;
 pub use relabel::relabel;
 pub use write::{check_target, export};
-
-/// The extension that holds the splats.
-pub const EXTENSION: &str = "KHR_gaussian_splatting";
-/// The extension by which a node is hidden.
-pub const VISIBILITY: &str = "KHR_node_visibility";
-/// The extension by which animations show and hide nodes.
-pub const POINTER: &str = "KHR_animation_pointer";
-/// Most expensive motion that a file can hold: build graphs for glTF with no more than this. Some splats
-/// ([`cif_scene::LOOSE_SPLATS`]) may have paths of their own nevertheless.
-pub const MOST_EXPENSIVE_MOTION: MotionModel = MotionModel::Parts;
-/// Attribute with the row of every splat in the field: two unsigned shorts, the low one first.
-pub const ROW: &str = "_CIF_ROW";
-/// Attribute with the occupancy of every splat.
-pub const OCCUPANCY: &str = "_CIF_OCCUPANCY";
-/// Attribute with the probability of the most probable instance of every splat.
-pub const IDENTITY: &str = "_CIF_IDENTITY";
-/// Attribute of the instances that every splat may belong to, as ids, most probable first; 0 for an unused place.
-pub const INSTANCE_IDS: &str = "_CIF_INSTANCE_IDS";
-/// Attribute beside [`INSTANCE_IDS`]: probability of each instance times the share of the splat's image that was
-/// labelled.
-pub const INSTANCE_SHARES: &str = "_CIF_INSTANCE_SHARES";
-
-const GENERATOR: &str = concat!("cif ", env!("CARGO_PKG_VERSION"));
-const GENERATOR_PREFIX: &str = "cif ";
 
 /// glTF 2.0: `.glb`, `.gltf`.
 #[derive(Clone, Copy, Debug)]
@@ -84,7 +65,7 @@ impl SceneFormat for Gltf {
         const ABOUT: About = About {
             name: "glTF",
             key: "gltf",
-            endings: &[Ending::written("glb", "one file"), Ending::written("gltf", "text beside a .bin")],
+            endings: &[Ending::written("glb", "one file"), Ending::written("gltf", "text next to a .bin")],
             files: "Objects that deform move as a few rigid parts; the table says what that misses",
             most_expensive_motion: Some(MOST_EXPENSIVE_MOTION),
             note_on_place: None,

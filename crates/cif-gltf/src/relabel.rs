@@ -15,11 +15,11 @@ const JSON_CHUNK: &[u8; 4] = b"JSON";
 
 /// Gives an object another label, and another class where one is given. `object` is a mask value or the name of a
 /// node. Nodes of ours keep their names; of other files the name of the node is its label, so that is what changes.
-/// The file is written anew beside `output`, which may be `path` itself, and then takes its place.
+/// The file is written anew next to `output`, which may be `path` itself, and then takes its place.
 ///
 /// # Errors
 /// A file that is missing, damaged or no glTF, no such object or several, an output of another kind, or in another
-/// folder while the file names others beside it. Nothing existing is touched then.
+/// folder while the file names others next to it. Nothing existing is touched then.
 pub fn relabel(
     path: &Path,
     output: &Path,
@@ -64,7 +64,7 @@ pub fn relabel(
     let original = std::fs::canonicalize(path).map_err(read)?;
     if folder(&original) != folder(&target) && names_files(&document) {
         return Err(invalid(format!(
-            "the file names others beside it, which {} would not find; write into the same folder",
+            "the file names others next to it, which {} would not find; write into the same folder",
             output.display()
         )));
     }

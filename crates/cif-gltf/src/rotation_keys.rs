@@ -169,7 +169,7 @@ mod tests {
             assert!(DQuat::from_vec4(*value).dot(rotation).abs() > 1.0 - 1e-7);
         }
 
-        // A key that someone moved stays, with those beside it; marks that make no sense do nothing.
+        // A key that someone moved stays, with those next to it; marks that make no sense do nothing.
         let (mut times, mut values) = written.clone();
         values[3] = DVec4::from(turned(0.5));
         drop_inserted(&mut times, &mut values, &filled.inserted);

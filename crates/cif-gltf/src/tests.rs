@@ -2,7 +2,9 @@
 
 use std::path::Path;
 
-use cif_scene::{CaptureFrame, Motion, NodeKind, PoseSample, SceneGraph, UpAxis, VisibilitySample};
+use cif_scene::{
+    CaptureFrame, Motion, MotionModel, NodeKind, PoseSample, SceneGraph, UpAxis, VisibilitySample,
+};
 use glam::{DMat3, DVec3};
 use proptest::prelude::*;
 use serde_json::{Value, json};
@@ -167,8 +169,8 @@ fn a_far_scene_stands_in_the_world_of_its_capture() {
     );
     for (a, b) in graph.nodes.iter().zip(&moved.nodes) {
         let code = graph.time_codes.start();
-        let way = b.world_transform(code).translation - a.world_transform(code).translation;
-        assert!((way - 2.0 * DVec3::X).length() < 0.05, "{way}");
+        let apart = b.world_transform(code).translation - a.world_transform(code).translation;
+        assert!((apart - 2.0 * DVec3::X).length() < 0.05, "{apart}");
     }
     let nowhere = edited(&graph, |json| {
         let root = node_index(json, "World");
@@ -209,7 +211,7 @@ fn moved_renamed_deleted_and_copied_objects_come_home() {
     assert_eq!(read.nodes[1].name, "blue_mug", "the label is left to whoever applies the edit");
     assert_eq!(read.nodes[1].pivot, DVec3::new(5.0, 6.0, 7.0));
     assert_eq!(read.nodes[1].motion, Motion::Static);
-    assert_eq!(read.nodes[3].splats, read.nodes[0].splats, "rows tell what was copied");
+    assert_eq!(read.nodes[3].splats, read.nodes[0].splats, "rows identify what was copied");
     let ids: Vec<NodeKind> = read.nodes.iter().map(|node| node.kind).collect();
     assert_eq!(ids[3], NodeKind::Instance { id: 2, index: 3 }, "an id of its own: {ids:?}");
     assert!(read.warnings.iter().any(|warning| warning.contains("repeats thing_000")), "{:?}", read.warnings);
@@ -417,7 +419,7 @@ fn labels_change_and_everything_else_stays() {
         }
         assert_eq!(read_scene(&path).unwrap(), expected);
 
-        // Into another file, by name; a file beside a .gltf is not found from elsewhere.
+        // Into another file, by name; a file next to a .gltf is not found from elsewhere.
         let copy = folder.path().join(format!("copy.{ending}"));
         relabel(&path, &copy, &instance.name, "cup", None).unwrap();
         assert!(

@@ -13,13 +13,14 @@ use cif_scene::files::{FileError, existing_folder, target_of};
 use serde::Deserialize;
 
 use crate::author::{Authored, author};
-use crate::{ExportOptions, ExportSummary, GENERATOR_PREFIX, GltfError, loose};
+use crate::names::GENERATOR_PREFIX;
+use crate::{ExportOptions, ExportSummary, GltfError, loose};
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Kind {
     /// JSON and buffer in one file.
     Binary,
-    /// JSON beside a file with the buffer.
+    /// JSON next to a file with the buffer.
     Text,
 }
 
@@ -68,7 +69,7 @@ fn checked_kind(path: &Path, options: ExportOptions) -> Result<(Kind, PathBuf), 
         if buffer.is_dir() {
             return Err(GltfError::IsFolder { path: buffer });
         }
-        // A buffer is ours where a .gltf of ours stands beside it.
+        // A buffer is ours where a .gltf of ours stands next to it.
         if buffer.exists() && !options.force && !ours {
             return Err(FileError::Foreign { path: buffer }.into());
         }
@@ -104,7 +105,7 @@ fn is_ours(path: &Path) -> bool {
     document.is_some_and(|document| document.asset.generator.starts_with(GENERATOR_PREFIX))
 }
 
-/// Writes a scene to a `.glb`, or to a `.gltf` with a `.bin` beside it: to temporary files in the same folder,
+/// Writes a scene to a `.glb`, or to a `.gltf` with a `.bin` next to it: to temporary files in the same folder,
 /// then renamed.
 ///
 /// # Errors

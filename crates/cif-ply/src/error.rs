@@ -19,7 +19,7 @@ pub enum PlyError {
         /// Given path.
         path: PathBuf,
     },
-    /// A folder is where a file is wanted, or the other way round.
+    /// A folder is where a file is expected, or the reverse.
     #[error("{path} is {found}, but {wanted} is to be written there; choose another name")]
     InTheWay {
         /// Given path.

@@ -127,7 +127,7 @@ fn frame(comments: &[String]) -> Result<CaptureFrame, String> {
         Some(words.map(|word| word.parse().ok()).collect())
     };
     for comment in comments {
-        let wrong = || format!("its comment '{}' tells no place; remove it", comment.trim());
+        let wrong = || format!("its comment '{}' is damaged and gives no place; remove it", comment.trim());
         if let Some(offset) = numbers(comment, WORLD_OFFSET) {
             frame.offset = offset.and_then(|offset| offset.try_into().ok()).ok_or_else(wrong)?;
         } else if let Some(scale) = numbers(comment, WORLD_SCALE) {
@@ -154,7 +154,7 @@ fn render_mode(comments: &[String], warnings: &mut Vec<String>) -> Option<bool> 
                 RENDER_MODE_MIP => antialiased = Some(true),
                 "default" | "2dgs" => antialiased = Some(false),
                 other => warnings.push(format!(
-                    "its render mode '{other}' is not known; its splats are drawn as usual ones"
+                    "its render mode '{other}' is not known; its splats are drawn in the default mode"
                 )),
             }
         } else if let Some(flag) = lower.strip_prefix("antialiased ") {

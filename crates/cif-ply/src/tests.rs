@@ -283,14 +283,14 @@ fn far_scenes_stay_precise_and_say_where_they_are() {
     let path = folder.path().join("far.ply");
     let frame = CaptureFrame { offset: [3.1e6, -2.7e5, 0.1], scale: 1e-3 };
     let near = scene(&[splats(5, 1)]);
-    for (frame, told) in [(frame, true), (CaptureFrame::default(), false)] {
+    for (frame, is_written) in [(frame, true), (CaptureFrame::default(), false)] {
         let graph = SceneGraph { frame, ..near.clone() };
         export(&graph, &path, ExportOptions { force: true, ..ExportOptions::default() }).unwrap();
         let bytes = std::fs::read(&path).unwrap();
         let text = String::from_utf8_lossy(&bytes);
         assert_eq!(
             text.contains("comment world offset 3100000 -270000 0.1\ncomment world scale 0.001\n"),
-            told
+            is_written
         );
         let back = read(&path).unwrap();
         assert_eq!(back.frame, frame);
@@ -303,8 +303,8 @@ fn far_scenes_stay_precise_and_say_where_they_are() {
         read(&path)
     };
     for wrong in ["world offset 1 2", "world offset 1 2 x", "world scale 0", "world offset 1 2 nan"] {
-        let told = with(&format!("comment cif 1\ncomment {wrong}\n")).unwrap_err().to_string();
-        assert!(told.contains(wrong) && told.contains("remove it"), "{told}");
+        let message = with(&format!("comment cif 1\ncomment {wrong}\n")).unwrap_err().to_string();
+        assert!(message.contains(wrong) && message.contains("remove it"), "{message}");
     }
     // Others may write what they like.
     assert!(with("comment made elsewhere\ncomment world offset 1 2\n").unwrap().frame.is_identity());

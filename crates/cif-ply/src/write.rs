@@ -15,14 +15,14 @@ use cif_scene::{Node, SceneGraph, Splats, UpAxis};
 use crate::pose::{turn_up, world_splats};
 use crate::{ExportOptions, ExportSummary, PlyError};
 
-/// First comment of our files; tells what may be replaced.
+/// First comment of our files; marks what may be replaced.
 const MARK: &str = concat!("comment cif ", env!("CARGO_PKG_VERSION"));
 /// Comments of files whose scene lies elsewhere in the world of its capture: `world = file / scale + offset`. Splats
 /// are kept in the scene's own frame, as far from the world's origin single precision would not hold them.
 pub(crate) const WORLD_OFFSET: &str = "world offset";
 /// See [`WORLD_OFFSET`].
 pub(crate) const WORLD_SCALE: &str = "world scale";
-/// Comment by which Brush and others tell how splats are drawn.
+/// Comment by which Brush and others record how splats are drawn.
 pub(crate) const RENDER_MODE: &str = "SplatRenderMode:";
 /// Of [`RENDER_MODE`]: footprints are widened and their opacity lowered in turn (Mip-Splatting).
 pub(crate) const RENDER_MODE_MIP: &str = "mip";
@@ -86,7 +86,7 @@ struct Job<'a> {
 }
 
 /// Writes a scene: to the file `path` (`.ply`), or with [`ExportOptions::split`] or [`ExportOptions::sequence`]
-/// into the folder `path`, which is created. Each file is written beside its place and renamed.
+/// into the folder `path`, which is created. Each file is written next to its place and renamed.
 ///
 /// # Errors
 /// A name that does not fit, a missing folder, files that are not ours (without [`ExportOptions::force`]), nothing

@@ -1,4 +1,4 @@
-//! Long work beside the interpreter: it runs in a thread of its own, while the thread that asked for it answers
+//! Long work while the interpreter goes on: it runs in a thread of its own, while the thread that asked for it answers
 //! signals and callbacks. So signals stay with the handlers that the program has, and Ctrl-C is a
 //! `KeyboardInterrupt`.
 

@@ -113,7 +113,7 @@ impl Dataset {
 
     /// Load image, uint8 `[H, W, 3]`, and mask, uint16 `[H, W]` (None without one), of a frame.
     ///
-    /// What is transparent in the image shows the background.
+    /// Transparent pixels show the background.
     #[pyo3(signature = (index, background=(1.0, 1.0, 1.0)))]
     fn load_frame<'py>(
         &self,

@@ -8,7 +8,7 @@ create_exception!(
     cif,
     CifError,
     PyException,
-    "A file, capture, field or stage is not as it should be; the message names it and the way out."
+    "A file, capture, field or stage is invalid; the message names it and the remedy."
 );
 
 /// The error of a library as a Python exception.

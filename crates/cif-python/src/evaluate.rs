@@ -66,7 +66,8 @@ fn scores(
         }
         measured => measured.and_then(Result::ok),
     };
-    let mut report = report_of(&evaluation, motion.as_ref(), field, decoder.map(Decoder::name));
+    let scores = report_of(&evaluation, motion.as_ref(), field, decoder.map(Decoder::name));
+    let mut report = json!(scores);
     report["warnings"] = json!(warnings);
     report["seconds"] = json!(start.elapsed().as_secs_f64());
     Ok(report)

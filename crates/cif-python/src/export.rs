@@ -103,7 +103,7 @@ fn build(
     }
 }
 
-/// Writes a field in the format that the ending tells; the answer tells of the files.
+/// Writes a field in the format of the ending; returns a summary of the files.
 pub(crate) fn export<'py>(
     py: Python<'py>,
     field: &Field,

@@ -194,7 +194,7 @@ impl Run {
 /// Train a field on a capture, and return it.
 ///
 /// dataset is an opened capture or its folder. With output, a .cif file, the run is saved there every five minutes,
-/// at the end of each stage and in the end, its settings beside it; without, it is only returned.
+/// at the end of each stage and in the end, its settings next to it; without, it is only returned.
 ///
 /// preset is "draft", "standard" (the default) or "paper"; effects says which effects are trained, "auto" (as the
 /// capture calls for), "all" or "none", then single ones on or off, as in "auto,-instances". settings are single
@@ -234,7 +234,7 @@ pub(crate) fn train(
         return Err(PyValueError::new_err("resume: preset, effects, settings and seed come from the output"));
     }
     if resume && output.is_none() {
-        return Err(PyValueError::new_err("resume: name the output to go on with"));
+        return Err(PyValueError::new_err("resume: name the output of the run to continue"));
     }
     let mut flat = Vec::new();
     if let Some(settings) = settings {

@@ -4,8 +4,10 @@ use std::env::{join_paths, split_paths};
 use std::ffi::{OsStr, OsString};
 use std::process::Command;
 
+use crate::environment;
+
 /// The search path of modules.
-const PATH: &str = "PYTHONPATH";
+const PATH: &str = environment::PYTHON_PATH.name();
 
 /// For Python from 3.11 on, and whatever Python it starts: the current folder is not searched.
 const SAFE_PATH: &str = "PYTHONSAFEPATH";
@@ -18,7 +20,7 @@ const WITHOUT_CURRENT: &str = "import sys; sys.path[:] = [path for path in sys.p
 /// absolute paths of `PYTHONPATH`.
 #[must_use]
 pub fn script(program: impl AsRef<OsStr>, script: &str) -> Command {
-    with_path(program.as_ref(), script, std::env::var_os(PATH))
+    with_path(program.as_ref(), script, environment::PYTHON_PATH.value())
 }
 
 fn with_path(program: &OsStr, script: &str, path: Option<OsString>) -> Command {
@@ -40,7 +42,7 @@ mod tests {
 
     #[test]
     fn modules_of_the_current_folder_are_not_found_and_those_of_the_path_are() {
-        let program = std::env::var_os("PYO3_PYTHON").unwrap_or_else(|| "python3".into());
+        let program = environment::BUILD_PYTHON.value().unwrap_or_else(|| "python3".into());
         let (current, named) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         for (folder, module) in [(&current, "planted"), (&named, "named")] {
             let package = folder.path().join(module);

@@ -54,14 +54,14 @@ pub enum UsdError {
         /// Given path.
         path: PathBuf,
     },
-    /// A folder is in the way.
+    /// A folder has the name of the file.
     #[error("{path} is a folder; give a file name")]
     IsFolder {
         /// The folder.
         path: PathBuf,
     },
     /// A package holds its arrays itself.
-    #[error("{path}: a package has no payloads beside it; use .usda or .usdc, or leave out --payloads")]
+    #[error("{path}: a package has no payloads next to it; use .usda or .usdc, or leave out --payloads")]
     PayloadsInPackage {
         /// Given path.
         path: PathBuf,

@@ -160,10 +160,10 @@ impl<'a, 'py> Search<'a, 'py> {
             None
         };
         let transform = matrix(&self.transform, prim)?;
-        let mut way = Vec::with_capacity(self.transforms.len());
+        let mut path = Vec::with_capacity(self.transforms.len());
         for cache in &self.transforms {
             let rows = matrix(cache, prim)?;
-            way.push(DVec3::new(rows[0][3], rows[1][3], rows[2][3]));
+            path.push(DVec3::new(rows[0][3], rows[1][3], rows[2][3]));
         }
         let (volume, volume_of) = volume(self.hull_volume(prim)?, &bounds);
         let mut names: Vec<String> = by_taxonomy.values().flatten().cloned().collect();
@@ -183,7 +183,7 @@ impl<'a, 'py> Search<'a, 'py> {
             },
             volume,
             volume_of,
-            speed: speed(&self.codes, &way, self.codes_per_second),
+            speed: speed(&self.codes, &path, self.codes_per_second),
             names,
             embedding: crate::read::labels::embedding(self.pxr, prim)?,
         }))

@@ -144,7 +144,7 @@ impl SceneFormat for Usd {
     }
 }
 
-/// Writes a scene to a `.usda`, `.usdc` or `.usdz` file: to a temporary file beside it, then renamed.
+/// Writes a scene to a `.usda`, `.usdc` or `.usdz` file: to a temporary file next to it, then renamed.
 ///
 /// # Errors
 /// Unknown extension, missing folder, a file there that is not ours (without [`ExportOptions::force`]),
@@ -191,11 +191,11 @@ pub fn code_range(path: &Path, options: ReadOptions) -> Result<CodeRange, UsdErr
 
 /// Gives an object of a stage another label, and another class where one is given: as semantic labels, display name
 /// and user property. `object` is a mask value, a unique name or a prim path. The root layer is edited in a copy
-/// beside `output`, which then takes its place; `output` may be `path` itself.
+/// next to `output`, which then takes its place; `output` may be `path` itself.
 ///
 /// # Errors
 /// No usd-core, a file that is missing, unreadable or a package, no such object or several, an output in another
-/// folder while the layer names files beside it. Nothing existing is touched then.
+/// folder while the layer names files next to it. Nothing existing is touched then.
 pub fn relabel(
     path: &Path,
     output: &Path,
@@ -216,7 +216,7 @@ pub fn relabel(
 /// - *Recoloured*: display colours that differ from those that were written replace the DC coefficients; higher
 ///   degrees stay.
 /// - *Moved*: any transform operations, also on ancestors. The part that is not rigid is baked into the splats.
-/// - *Duplicated*: a copy keeps the id and the rows of its original, under its own name; a warning tells so. The
+/// - *Duplicated*: a copy keeps the id and the rows of its original, under its own name; with a warning. The
 ///   original is the one whose name is its `instance` label.
 /// - *Hidden*: by `visibility` of the prim or an ancestor, also over time.
 ///

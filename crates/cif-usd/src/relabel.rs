@@ -64,7 +64,7 @@ pub(crate) fn relabel(
         let layer = stage.call_method0("GetRootLayer").map_err(python)?;
         if moved && has_references(&layer).map_err(python)? {
             return Err(refused(format!(
-                "it names other files beside it, which {} would not find; write into the same folder",
+                "it names other files next to it, which {} would not find; write into the same folder",
                 output.display()
             )));
         }

@@ -234,7 +234,7 @@ pub const PRIMVAR_IDENTITY: &str = "primvars:cif:identity";
 /// Primvar of the instances that every splat may belong to, as ids, most probable first; 0 for an unused place.
 /// `elementSize` of them per splat.
 pub const PRIMVAR_INSTANCE_IDS: &str = "primvars:cif:instanceIds";
-/// Primvar beside [`PRIMVAR_INSTANCE_IDS`]: probability of each instance times the share of the splat's image that
+/// Primvar next to [`PRIMVAR_INSTANCE_IDS`]: probability of each instance times the share of the splat's image that
 /// was labelled. The remainder to 1 was seen outside of every mask.
 pub const PRIMVAR_INSTANCE_SHARES: &str = "primvars:cif:instanceShares";
 /// Primvar of the row of every splat in the field.

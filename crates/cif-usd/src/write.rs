@@ -30,7 +30,7 @@ fn kind_of(path: &Path) -> Result<Kind, UsdError> {
     }
 }
 
-/// Folder of the payloads of a stage: `out.payloads` beside `out.usda`, `out.usdc.payloads` beside `out.usdc`, so
+/// Folder of the payloads of a stage: `out.payloads` next to `out.usda`, `out.usdc.payloads` next to `out.usdc`, so
 /// that stages with one name and several endings do not share it.
 fn payloads_of(path: &Path) -> PathBuf {
     if kind_of(path).is_ok_and(|kind| kind == Kind::Text) {
@@ -169,8 +169,8 @@ fn keep_foreign(pxr: &Pxr<'_>, old: &Path, new: &Path) -> std::io::Result<Vec<Pa
     Ok(kept)
 }
 
-/// What goes with an old folder of payloads that the new stage does without, and what stays: the folder, or where it
-/// holds files of others, ours among them.
+/// Files that go with an old folder of payloads that the new stage does without, and what stays: the folder, or where
+/// it holds files of others, ours among them.
 fn unneeded(pxr: &Pxr<'_>, old: &Path) -> std::io::Result<[Vec<PathBuf>; 2]> {
     Ok(match by_writer(pxr, old)? {
         [ours, others] if !ours.is_empty() && others.is_empty() => [vec![old.to_owned()], others],

@@ -18,7 +18,7 @@ use crate::{Error, Picture};
 /// Goes up when the same models and pictures give other masks.
 const VERSION: u32 = 1;
 
-/// Keyword of the text that tells the boxes, as JSON.
+/// Keyword of the text that holds the boxes, as JSON.
 const KEYWORD: &str = "cif boxes";
 
 /// Longest part of a prompt in a name, characters.

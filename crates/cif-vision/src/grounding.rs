@@ -2,7 +2,7 @@
 //!
 //! Source: `groundingdino.util.inference` of its authors. The picture's short side becomes 800 pixels, its long side at
 //! most 1 333; the prompt is in lower case and ends with a dot; a box counts when the greatest of its scores over all
-//! tokens exceeds a threshold. Words whose own score exceeds another threshold tell what the box is for; they do not
+//! tokens exceeds a threshold. Words whose own score exceeds another threshold name what the box holds; they do not
 //! decide whether it counts.
 
 use std::path::Path;
@@ -252,7 +252,7 @@ mod tests {
             [low, logit(0.29), low, low, low, low, low, f32::NEG_INFINITY],
             // A box for two words, one of which is below the threshold of words.
             [low, logit(0.5), logit(0.44), low, low, low, low, f32::NEG_INFINITY],
-            // Above that of boxes, but no word is told.
+            // Above that of boxes, but no word is named.
             [low, low, low, logit(0.4), low, low, low, f32::NEG_INFINITY],
             [low, logit(0.9), logit(0.8), logit(0.7), low, low, low, f32::NEG_INFINITY],
             [f32::NAN; 8],
@@ -266,9 +266,10 @@ mod tests {
         ];
         let queries = logits.iter().map(<[f32; 8]>::as_slice).zip(boxes.iter().map(<[f32; 4]>::as_slice));
         let found = found(queries, TEXT, &tokens(0), (200, 100), Thresholds::default());
-        let told: Vec<(&str, [f32; 4])> = found.iter().map(|one| (one.words.as_str(), one.corners)).collect();
+        let named: Vec<(&str, [f32; 4])> =
+            found.iter().map(|one| (one.words.as_str(), one.corners)).collect();
         assert_eq!(
-            told,
+            named,
             [
                 ("red mug", [50.0, 0.0, 200.0, 100.0]),
                 ("red", [50.0, 37.5, 150.0, 62.5]),

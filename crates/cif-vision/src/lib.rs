@@ -14,11 +14,10 @@
 //! | [`cache`] | masks that were made before |
 //!
 //! Nothing is downloaded: models, tokenizers and the library of ONNX Runtime are files of the user's. Without the feature
-//! `onnx` all of this is there but for running models, which is refused with the way to get it.
+//! `onnx` all of this is there but for running models, which is refused with advice on how to get it.
 
 pub mod cache;
 pub mod embedding;
-mod error;
 pub mod grounding;
 pub mod library;
 pub mod models;
@@ -30,7 +29,7 @@ pub mod tensor;
 
 pub use cache::Cache;
 
-pub use error::Error;
+pub use cif_system::Error;
 pub use models::Models;
 pub use picture::Picture;
 pub use prompt::Prompter;

@@ -5,10 +5,12 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 
+use cif_system::environment::ONNX_RUNTIME;
+
 use crate::Error;
 
 /// Environment variable that names the library.
-pub const VARIABLE: &str = "ORT_DYLIB_PATH";
+pub const VARIABLE: &str = ONNX_RUNTIME.name();
 
 /// Prints the folder of the package without importing it, and nothing where it is missing.
 const SCRIPT: &str = "import importlib.util as u; s = u.find_spec('onnxruntime'); \
@@ -19,7 +21,7 @@ const SCRIPT: &str = "import importlib.util as u; s = u.find_spec('onnxruntime')
 /// # Errors
 /// When there is none, or the variable names no file.
 pub fn find(pythons: &[OsString]) -> Result<PathBuf, Error> {
-    find_named(std::env::var_os(VARIABLE), pythons)
+    find_named(ONNX_RUNTIME.value(), pythons)
 }
 
 fn find_named(named: Option<OsString>, pythons: &[OsString]) -> Result<PathBuf, Error> {
@@ -118,7 +120,7 @@ mod tests {
     #[test]
     fn a_package_of_the_current_folder_is_not_taken() {
         const FOLDER: &str = "CIF_VISION_TEST_FOLDER";
-        let python = std::env::var_os("PYO3_PYTHON").unwrap_or_else(|| "python3".into());
+        let python = cif_system::environment::BUILD_PYTHON.value().unwrap_or_else(|| "python3".into());
         if let Some(folder) = std::env::var_os(FOLDER) {
             let found = package(&python);
             assert!(!found.as_ref().is_some_and(|found| found.starts_with(folder)), "{found:?}");

@@ -206,7 +206,7 @@ impl Models {
     }
 }
 
-/// A file and those beside it whose names begin with its own, as external data of ONNX models have it, in order.
+/// A file and those next to it whose names begin with its own, as external data of ONNX models have it, in order.
 fn with_data(file: &Path) -> Vec<PathBuf> {
     let name = file.file_name().unwrap_or_default().as_encoded_bytes();
     let mut files = vec![file.to_owned()];
@@ -259,8 +259,8 @@ mod tests {
         assert!(problem(empty.path()).contains("no models.toml"));
         assert!(problem(folder(DETECTOR, &["t.json"]).path()).contains("d.onnx"));
         let unknown = DETECTOR.replace("tokenizer", "tokeniser");
-        let told = problem(folder(&unknown, &["d.onnx", "t.json"]).path());
-        assert!(told.contains("tokeniser") && told.contains("line 3"), "{told}");
+        let message = problem(folder(&unknown, &["d.onnx", "t.json"]).path());
+        assert!(message.contains("tokeniser") && message.contains("line 3"), "{message}");
         let models = folder(DETECTOR, &["d.onnx", "t.json"]);
         let models = Models::open(models.path()).unwrap();
         assert_eq!(models.detector().unwrap().outputs["boxes"], "b");

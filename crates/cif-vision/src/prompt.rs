@@ -27,7 +27,7 @@ impl<'a> Prompter<'a> {
         Self { models, pythons, thresholds, opened: None }
     }
 
-    /// Opens the models, so that what is missing is told before the first question.
+    /// Opens the models, so that missing files are reported before the first question.
     ///
     /// # Errors
     /// When a model is missing or does not fit, or the library that runs it is not there.
@@ -37,7 +37,7 @@ impl<'a> Prompter<'a> {
 
     fn opened(&mut self) -> Result<&mut (Detector, Segmenter), Error> {
         if self.opened.is_none() {
-            // What the folder lacks is told before the library is looked for.
+            // Missing models are reported before the library is looked for.
             self.models.detector()?;
             self.models.segmenter()?;
             let library = library::find(self.pythons)?;

@@ -117,7 +117,7 @@ impl Segmenter {
         Ok(union)
     }
 
-    /// Inputs that tell the decoder of a box, as far as it has them.
+    /// Inputs that give the decoder a box, as far as it has them.
     fn prompts(&self, corners: Vec<f32>, (width, height): (u32, u32)) -> Vec<(&'static str, Tensor)> {
         let decoder = &self.decoder;
         let has_box = decoder.has_input("boxes");

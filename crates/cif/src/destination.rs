@@ -29,7 +29,7 @@ pub enum Existing {
 #[derive(Debug)]
 pub enum Unsaved {
     /// Something else has appeared in the place of the file since the run began or saved last. The state was saved
-    /// beside it, as the error tells; the run has no file any more.
+    /// next to it, as the error says; the run has no file any more.
     Taken(Error),
     /// The file system refuses, perhaps for the moment.
     Refused(Error),
@@ -61,7 +61,7 @@ impl Destination {
         if existing == Existing::Keep && path.exists() && is_unfinished(path) {
             return Err(Error::failed(
                 format!("{} exists and holds a run that was interrupted", path.display()),
-                "give --resume to go on with it, --force to replace it, or choose another name",
+                "give --resume to continue it, --force to replace it, or choose another name",
             ));
         }
         output::check_file(path, existing == Existing::Replace)?;
@@ -98,7 +98,7 @@ impl Destination {
         self.written = self.settings_path.exists().then(|| text_of(config));
     }
 
-    /// Saves a state of the run, and its settings beside it.
+    /// Saves a state of the run, and its settings next to it.
     ///
     /// # Errors
     /// When something else has taken the place of the file, or it cannot be written.
@@ -114,7 +114,7 @@ impl Destination {
     /// files, because hours of training may be in it.
     ///
     /// # Errors
-    /// Whenever the state is not in its file; the error tells where it is.
+    /// Whenever the state is not in its file; the error says where it is.
     pub fn save_or_rescue(&mut self, checkpoint: &Checkpoint, config: &TrainConfig) -> Result<(), Error> {
         self.save(checkpoint, config).map_err(|unsaved| match unsaved {
             Unsaved::Taken(error) => error,
@@ -147,7 +147,7 @@ impl Destination {
         Ok(())
     }
 
-    /// Saves a state under a free name beside the file, which something else has written.
+    /// Saves a state under a free name next to the file, which something else has written.
     fn save_beside(&self, checkpoint: &Checkpoint) -> Error {
         let name = self.path.display();
         let message = format!("{name} was written by something else while this run went on, and is kept");
@@ -157,10 +157,7 @@ impl Destination {
             match save_anew(checkpoint, &path) {
                 Ok(true) => {
                     let help = if checkpoint.training.is_some() {
-                        format!(
-                            "this run was saved as {0}; --resume with -o {0} goes on with it",
-                            path.display()
-                        )
+                        format!("this run was saved as {0}; continue it with --resume -o {0}", path.display())
                     } else {
                         format!("this run was saved as {}", path.display())
                     };
@@ -170,7 +167,7 @@ impl Destination {
                 Err(error) => return Error::plain(format!("{message}; {error}")),
             }
         }
-        Error::failed(message, "this run could not be saved: a thousand names beside it are taken")
+        Error::failed(message, "this run could not be saved: a thousand names next to it are taken")
     }
 
     /// True where there are settings that are not to be replaced.

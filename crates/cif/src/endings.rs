@@ -10,7 +10,7 @@ use crate::formats::FORMATS;
 /// Endings of films, which `cif render` makes the frames of.
 const FILMS: [&str; 6] = ["mp4", "mov", "mkv", "webm", "avi", "gif"];
 
-/// Endings of files that are no folders, beside those of films and of scenes.
+/// Endings of files that are no folders, other than those of films and of scenes.
 const FILES: [&str; 13] =
     ["png", "jpg", "jpeg", "exr", "json", "jsonl", "csv", "html", "md", "toml", "npz", "zip", "svg"];
 

@@ -66,11 +66,11 @@ impl From<cif_exr::ExrError> for Error {
     }
 }
 
-impl From<cif_vision::Error> for Error {
-    fn from(error: cif_vision::Error) -> Self {
+impl From<cif_system::Error> for Error {
+    fn from(error: cif_system::Error) -> Self {
         match error {
-            cif_vision::Error::Io { action, path, source } => Self::io(action, &path)(source),
-            cif_vision::Error::Refused { problem, fix } => Self::failed(problem, fix),
+            cif_system::Error::Io { action, path, source } => Self::io(action, &path)(source),
+            cif_system::Error::Refused { problem, fix } => Self::failed(problem, fix),
             other => Self::plain(other),
         }
     }

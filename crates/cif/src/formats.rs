@@ -69,7 +69,7 @@ fn unknown_ending(path: &Path, known: &str) -> Error {
         );
     }
     Error::usage(
-        format!("{name}: the ending of the name tells the format, and this one is not known"),
+        format!("{name}: the format follows from the ending of the name, and this ending is not known"),
         format!("use {known}"),
     )
 }
@@ -135,7 +135,7 @@ pub fn name_of(path: &Path) -> String {
     path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
-/// Reads two files of any format to be compared. A `.cif` beside a file that was exported becomes the graph that
+/// Reads two files of any format to be compared. A `.cif` that is compared with an exported file becomes the graph that
 /// it would be exported as with the same options.
 ///
 /// # Errors

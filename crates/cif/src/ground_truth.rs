@@ -190,7 +190,7 @@ mod tests {
 
     fn truth(kind: &str) -> MotionTruth {
         let poses: Vec<RigidTransform> = (0..3).map(object_pose).collect();
-        // The box is centred half a metre beside the object's origin.
+        // The box is centred half a metre next to the object's origin.
         let centres = poses.iter().map(|pose| pose.apply(DVec3::X * 0.5));
         let known = TrueMotion {
             label: "box".into(),

@@ -36,7 +36,7 @@ fn end_cleanly() {
 #[cfg(not(unix))]
 fn end_cleanly() {}
 
-/// Bit k - 1 for signal k, as far as the system tells.
+/// Bit k - 1 for signal k, as far as the system reports it.
 #[cfg(unix)]
 fn ignored_signals() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
@@ -193,7 +193,7 @@ mod tests {
         let requests = Requests::new();
         requests.begin();
         assert!(!requests.requested());
-        assert!(!requests.request() && requests.request(), "the second one is told from the first");
+        assert!(!requests.request() && requests.request(), "the second one is distinguished from the first");
         requests.begin();
         assert!(requests.requested(), "one that is being stopped is not forgotten");
         requests.end();

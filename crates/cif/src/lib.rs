@@ -63,6 +63,7 @@ use std::ffi::OsString;
 use std::io::IsTerminal;
 use std::path::PathBuf;
 
+use cif_system::environment::NO_COLOR;
 use clap::Parser;
 use miette::{GraphicalReportHandler, GraphicalTheme};
 
@@ -132,7 +133,7 @@ pub fn run(arguments: Vec<OsString>) -> i32 {
 }
 
 fn report(error: &Error) {
-    let theme = if std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none() {
+    let theme = if std::io::stderr().is_terminal() && NO_COLOR.value().is_none() {
         GraphicalTheme::unicode()
     } else {
         GraphicalTheme::unicode_nocolor()

@@ -22,7 +22,7 @@ const PAUSE: Duration = Duration::from_millis(50);
 const LONGEST_LINE: u64 = 200;
 
 /// A file that is locked for this process: the system releases it however the process ends. Held as a lock on
-/// `.NAME.lock` beside the file, which is removed in the end.
+/// `.NAME.lock` next to the file, which is removed in the end.
 #[derive(Debug)]
 pub struct Lock {
     /// Removed while it is still locked, so that nobody else's is.

@@ -1,4 +1,4 @@
-//! What a command says on stderr besides its answer: notes and outcomes, which `--quiet` leaves out, and warnings,
+//! Messages of a command on stderr besides its answer: notes and outcomes, which `--quiet` leaves out, and warnings,
 //! which stay. Answers go to stdout.
 
 use std::borrow::Cow;
@@ -66,7 +66,7 @@ mod tests {
     fn names_do_not_command_terminals() {
         assert_eq!(plain("walk \u{1b}[31m.jpg\nnext\tline"), "walk \\u{1b}[31m.jpg\nnext\tline");
         assert!(matches!(plain("tasse é.jpg"), Cow::Borrowed(_)));
-        let told = crate::Error::plain("a\u{7}.jpg: damaged").to_string();
-        assert_eq!(told, "a\\u{7}.jpg: damaged");
+        let message = crate::Error::plain("a\u{7}.jpg: damaged").to_string();
+        assert_eq!(message, "a\\u{7}.jpg: damaged");
     }
 }

@@ -4,7 +4,7 @@
 //! |---|---|
 //! | `36` | frame 36, which is time code 36 of the exported stage; fractions lie between frames |
 //! | `1.5s` | one and a half seconds after the first frame |
-//! | `50%` | half way from the first frame to the last |
+//! | `50%` | halfway from the first frame to the last |
 //!
 //! A scene, its stage and its glTF file give the same answer to the same words.
 
@@ -23,7 +23,7 @@ pub(crate) enum Moment {
     Frame(f64),
     /// Seconds after the first frame.
     Seconds(f64),
-    /// A share of the way from the first frame to the last, percent.
+    /// A share of the time from the first frame to the last, percent.
     Percent(f64),
 }
 

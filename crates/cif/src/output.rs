@@ -155,7 +155,7 @@ pub fn check_file(path: &Path, overwrite: bool) -> Result<(), Error> {
     }
     let target = match cif_output::target(path) {
         Ok(target) => target,
-        // Files can be no folders; told below.
+        // Files can be no folders; refused below.
         Err(error) if error.kind() == io::ErrorKind::NotADirectory => path.to_owned(),
         Err(error) => {
             return Err(Error::failed(
@@ -330,7 +330,7 @@ mod tests {
             std::os::unix::fs::symlink("t.cif", &link).unwrap();
             assert!(outputs.file(&link).is_err());
         }
-        // The other way about: what is read turns out later.
+        // The reverse: the inputs are known later.
         let late = folder.path().join("late.json");
         outputs.file(&late).unwrap();
         assert!(outputs.reads(&late).is_err());

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use cif_train::{Phase, TrainEvent};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use serde::Serialize;
 
 use crate::error::Error;
 
@@ -32,9 +33,9 @@ pub struct Progress {
     start: Instant,
     log: Log,
     log_failure: Option<Error>,
-    /// Phases under way, the innermost last, with what the bar showed of each.
+    /// Phases under way, the innermost last, with the text of the bar for each.
     phases: Vec<(Phase, Shown)>,
-    /// What was trained, once it is.
+    /// Summary of the trained scene, once there is one.
     trained: Option<String>,
 }
 
@@ -47,12 +48,21 @@ struct Shown {
     message: String,
 }
 
-/// Where events are logged.
+/// Destination of the log of events.
 enum Log {
     /// It is not known yet; lines so far.
     Undecided(Vec<String>),
     File(PathBuf, File),
     Nowhere,
+}
+
+/// A line of the log of `cif train --log`: an event, and when it happened.
+#[derive(Serialize)]
+struct LogLine<'a> {
+    #[serde(flatten)]
+    event: &'a TrainEvent,
+    /// Time since the start of this run, seconds.
+    time_s: f64,
 }
 
 impl Progress {
@@ -291,9 +301,9 @@ impl Progress {
         if matches!(self.log, Log::Nowhere) {
             return;
         }
-        let mut value = serde_json::to_value(event).expect("events are plain data");
-        value["time_s"] = serde_json::json!((self.start.elapsed().as_secs_f64() * 1e3).round() / 1e3);
-        self.log_line(value.to_string());
+        let time_s = (self.start.elapsed().as_secs_f64() * 1e3).round() / 1e3;
+        let line = serde_json::to_value(LogLine { event, time_s }).expect("events are plain data");
+        self.log_line(line.to_string());
     }
 
     fn log_line(&mut self, line: String) {

@@ -5,10 +5,12 @@
 //! named pipe), and an argument of its own otherwise, so that `cif info --json captures/table` is what it looks like.
 
 use std::ffi::{OsStr, OsString};
+use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
 use cif_output::Place;
 use clap::Args;
+use serde::Serialize;
 use serde_json::Value;
 
 use crate::endings;
@@ -24,10 +26,17 @@ const OLD_FLAG: &str = "--report-json";
 /// The flag of `cif query` whose file, a table of paths, may be left out too.
 const PATHS_FLAG: &str = "--trajectory";
 
+/// A type whose values are reports. `docs/reference/json.md` describes every type that implements this, from its doc
+/// comments; no other value can be given.
+pub(crate) trait JsonReport: Serialize {
+    /// Commands whose report it is, with the options that make it.
+    const COMMANDS: &'static [&'static str];
+}
+
 /// A report of a command that has `--force` for other files as well.
 #[derive(Clone, Debug, Default, Args)]
 pub(crate) struct Report {
-    /// Print the report as JSON and nothing else, or write it to FILE, whose name ends in .json
+    /// Print the report as JSON and nothing else, or write it to FILE (.json)
     #[arg(
         long,
         value_name = "FILE",
@@ -71,16 +80,20 @@ impl Report {
     /// Prints or writes the report; unless it is all that goes to stdout, `print` prints tables there.
     ///
     /// # Errors
-    /// When the file cannot be written.
-    pub(crate) fn give(&self, report: impl FnOnce() -> Value, print: impl FnOnce()) -> Result<(), Error> {
+    /// When the file cannot be written, or a path in the report is not UTF-8.
+    pub(crate) fn give<R: JsonReport>(
+        &self,
+        report: impl FnOnce() -> R,
+        print: impl FnOnce(),
+    ) -> Result<(), Error> {
         if self.to_stdout() {
-            println!("{:#}", report());
+            println!("{:#}", json(&report())?);
             return Ok(());
         }
         // First the file: the reader of the tables may have left.
         let written = self
             .file()
-            .map_or(Ok(()), |path| output::write_file(path, format!("{:#}\n", report()).as_bytes()));
+            .map_or(Ok(()), |path| output::write_file(path, format!("{:#}\n", json(&report())?).as_bytes()));
         print();
         written
     }
@@ -117,7 +130,11 @@ impl OnlyReport {
     ///
     /// # Errors
     /// As [`Report::give`].
-    pub(crate) fn give(&self, report: impl FnOnce() -> Value, print: impl FnOnce()) -> Result<(), Error> {
+    pub(crate) fn give<R: JsonReport>(
+        &self,
+        report: impl FnOnce() -> R,
+        print: impl FnOnce(),
+    ) -> Result<(), Error> {
         self.report.give(report, print)
     }
 
@@ -127,13 +144,38 @@ impl OnlyReport {
     }
 }
 
-/// A report that the command has written into its own folder as well.
-///
-/// # Errors
-/// When it cannot be read again.
-pub(crate) fn read(path: &Path) -> Result<Value, Error> {
-    let text = std::fs::read(path).map_err(Error::io("read", path))?;
-    serde_json::from_slice(&text).map_err(|error| Error::plain(format!("{}: {error}", path.display())))
+/// A report as JSON; keys are sorted.
+fn json<R: JsonReport>(report: &R) -> Result<Value, Error> {
+    let failed = |error| format!("the report of {} cannot be JSON: {error}", R::COMMANDS.join(", "));
+    serde_json::to_value(report).map_err(|error| Error::plain(failed(error)))
+}
+
+/// A `T` that is read from a file, or from the record of a scene, and passed on unchanged.
+#[derive(Serialize)]
+#[serde(transparent)]
+pub(crate) struct Stored<T> {
+    json: Value,
+    #[serde(skip)]
+    kind: PhantomData<T>,
+}
+
+impl<T> Stored<T> {
+    /// Reads the file.
+    ///
+    /// # Errors
+    /// When it cannot be read again.
+    pub(crate) fn read(path: &Path) -> Result<Self, Error> {
+        let text = std::fs::read(path).map_err(Error::io("read", path))?;
+        let json: Value = serde_json::from_slice(&text)
+            .map_err(|error| Error::plain(format!("{}: {error}", path.display())))?;
+        Ok(Self::from(json))
+    }
+}
+
+impl<T> From<Value> for Stored<T> {
+    fn from(json: Value) -> Self {
+        Self { json, kind: PhantomData }
+    }
 }
 
 /// True where a word can be the file of a flag whose files have an ending.

@@ -33,7 +33,9 @@ pub fn run(
                 }
                 // There may be space again when the next state is due.
                 Err(Unsaved::Refused(error)) => {
-                    observe(&TrainEvent::Warning { message: format!("{error}; the run goes on unsaved") });
+                    observe(&TrainEvent::Warning {
+                        message: format!("{error}; the run continues without saving"),
+                    });
                 }
             }
         }

@@ -129,14 +129,16 @@ fn a_comparison_out_of_time_tells_what_is_missing_and_goes_on() {
     };
     // Nothing begins, not even the reconstruction.
     let told = cif(path, &line("cif", "--budget 0s")).succeeds();
-    assert!(told.stderr.contains("goes on with the 2 runs"), "{}", told.stderr);
+    assert!(told.stderr.contains("again for the 2 runs"), "{}", told.stderr);
     assert!(
-        told.stdout.contains("Not done yet, and not in the means: table with CIF (seed 0, 1)"),
+        told.stdout.contains("Missing, and not in the means: table with CIF (seed 0, 1)"),
         "{}",
         told.stdout
     );
     assert_eq!(fs::read_dir(path.join("out/runs")).unwrap().count(), 0);
-    assert!(!cif(path, &line("cif", "--budget 1h")).succeeds().stdout.contains("Not done yet"));
+    assert!(
+        !cif(path, &line("cif", "--budget 1h")).succeeds().stdout.contains("Missing, and not in the means")
+    );
     // What is there is kept and told; what is not is named.
     let told = cif(path, &line("cif,dr-splat", "--budget 0s")).succeeds();
     assert_eq!(told.stderr.matches(": kept, ").count(), 2, "{}", told.stderr);
@@ -147,7 +149,7 @@ fn a_comparison_out_of_time_tells_what_is_missing_and_goes_on() {
     }
     let told = cif(path, &line("cif,dr-splat", "")).succeeds();
     assert_eq!(told.stderr.matches(": kept, ").count(), 2, "{}", told.stderr);
-    assert!(!told.stdout.contains("Not done yet"), "{}", told.stdout);
+    assert!(!told.stdout.contains("Missing, and not in the means"), "{}", told.stdout);
     cif(path, &line("cif", "--budget soon")).fails(2, &["--budget"]);
 }
 
@@ -299,7 +301,7 @@ fn scenes_of_a_comparison_answer_questions_in_words() {
     let told = cif(path, &line("--budget 0s")).succeeds();
     assert!(told.stderr.contains("questions that 2 scenes have not answered"), "{}", told.stderr);
     assert!(
-        told.stdout.contains("Not done yet, and not in the means: table with CIF (seed 0)"),
+        told.stdout.contains("Missing, and not in the means: table with CIF (seed 0)"),
         "{}",
         told.stdout
     );

@@ -4,6 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, generate};
+use cif_system::environment::TEST_GPU;
 use cif_test::command::{Run, run};
 use serde_json::{Value, json};
 
@@ -15,7 +16,7 @@ fn cif(folder: &Path, line: &str) -> Run {
 
 /// What `cif info --gpu` says, when a GPU is to be used here.
 fn gpu(folder: &Path) -> Option<Value> {
-    let wish = std::env::var("CIF_TEST_GPU").unwrap_or_else(|_| "auto".to_owned());
+    let wish = TEST_GPU.text().unwrap_or_else(|| "auto".to_owned());
     assert!(["off", "auto", "require"].contains(&wish.as_str()), "CIF_TEST_GPU is {wish}");
     if wish == "off" {
         eprintln!("skipped: CIF_TEST_GPU=off");

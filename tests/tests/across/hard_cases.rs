@@ -38,6 +38,11 @@ fn every_row_names_tests_that_exist() {
         for (path, name) in tests {
             let source =
                 fs::read_to_string(root.join(path)).unwrap_or_else(|e| panic!("row {number}: {path}: {e}"));
+            // A function of a suite, which is a test of every renderer.
+            let suite = source.split_once("tests_of!(").map_or("", |(_, list)| list);
+            if suite.lines().any(|line| line.trim() == format!("{name},")) {
+                continue;
+            }
             let declared =
                 source.lines().map(str::trim).position(|line| line.starts_with(&format!("fn {name}(")));
             let declared = declared.unwrap_or_else(|| panic!("row {number}: {path} has no test {name}"));

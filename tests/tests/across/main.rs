@@ -23,4 +23,5 @@ mod reference;
 mod render_memory;
 mod unfinished_capture;
 mod vision;
+mod where_is_it;
 mod whole_path;

@@ -283,7 +283,7 @@ fn the_command_to_go_on_with_can_be_pasted() {
     fs::rename(path.join("table"), path.join("my table")).unwrap();
     let start = ["train", "my table", "-o", "it's $HOME.cif", "--stop-after", "1"];
     let stopped = run(CIF, path, start.into_iter().chain(TINY.split_whitespace())).succeeds();
-    let (_, line) = stopped.stderr.split_once("go on with: cif ").expect("the command is told");
+    let (_, line) = stopped.stderr.split_once("continue with: cif ").expect("the command is told");
     let script = format!("\"$CIF\" {}", line.lines().next().unwrap());
     let status = std::process::Command::new("sh")
         .args(["-c", &script])

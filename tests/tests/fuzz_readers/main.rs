@@ -16,6 +16,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use cif_system::environment::{FUZZ_MINUTES, FUZZ_READER, FUZZ_SEED, Variable};
 use peak_alloc::PeakAlloc;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
@@ -174,13 +175,13 @@ struct Plan {
 
 impl Plan {
     fn read() -> Self {
-        let number = |name: &str| std::env::var(name).ok().filter(|text| !text.is_empty());
+        let given = |variable: &Variable| variable.text().filter(|text| !text.is_empty());
         Self {
-            time: number("CIF_FUZZ_MINUTES").map(|text| {
+            time: given(&FUZZ_MINUTES).map(|text| {
                 Duration::from_secs_f64(60.0 * text.parse::<f64>().expect("CIF_FUZZ_MINUTES is a number"))
             }),
-            only: number("CIF_FUZZ_READER").unwrap_or_default(),
-            seed: number("CIF_FUZZ_SEED").map(|text| text.parse().expect("CIF_FUZZ_SEED is a number")),
+            only: given(&FUZZ_READER).unwrap_or_default(),
+            seed: given(&FUZZ_SEED).map(|text| text.parse().expect("CIF_FUZZ_SEED is a number")),
         }
     }
 }

@@ -44,7 +44,7 @@ pub enum Work {
     Export(Tolerance),
 }
 
-/// One way to do it.
+/// One setting.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rung {
     /// File name, unique in a report.
@@ -165,259 +165,315 @@ pub fn ladders(base: &Base) -> Vec<Ladder> {
     NAMES.iter().map(|name| ladder(name, base)).filter(|ladder| ladder.rungs.len() > 1).collect()
 }
 
+/// Title, description and rungs of a ladder.
+type Parts = (&'static str, &'static str, Vec<Rung>);
+
 fn ladder(name: &'static str, base: &Base) -> Ladder {
-    let quick = base.quick;
-    let factors = |all: &[f64], few: &[f64]| if quick { few.to_vec() } else { all.to_vec() };
-    let scaled = |value: u32, factor: f64| (f64::from(value) * factor).round().max(1.0) as u32;
     let (title, about, rungs) = match name {
-        "presets" => {
-            let whole = |name| Work::Preset { name, share: 1.0, settings: Vec::new() };
-            let named = |name: &'static str| rung(&format!("preset-{name}"), name, whole(name));
-            let rungs = if quick {
-                vec![train("", "quick base", &[]), named("draft")]
-            } else {
-                vec![named("draft"), named("standard")]
-            };
-            ("Presets", "Named settings, all of them at once.", rungs)
-        }
-        PAPER => {
-            let rungs = base.paper.as_ref().map_or_else(Vec::new, |Paper { share, settings }| {
-                let percent = format!("{:.3}", 100.0 * share);
-                let percent = percent.trim_end_matches('0').trim_end_matches('.');
-                let label = match *share < 1.0 {
-                    true => format!("paper, {percent} % of its steps"),
-                    false => "paper".to_owned(),
-                };
-                let work = Work::Preset { name: PAPER, share: *share, settings: settings.clone() };
-                vec![train("", "base", &[]), rung(PAPER, &label, work)]
-            });
-            (
-                "The paper's configuration",
-                "The preset `paper` for the layout of the capture: batch, planes, network, losses, densification and rates \
-                 as published. Where its row says so, it has a share of the published steps, with everything that counts in \
-                 steps shortened alike, or the settings named there; without, it is whole.",
-                rungs,
-            )
-        }
-        "iterations" => (
-            "Iterations",
-            "Steps of all stages, with everything that counts in steps stretched alike.",
-            factors(&[0.25, 0.5, 1.0, 2.0], &[0.5, 1.0, 2.0])
-                .into_iter()
-                .map(|factor| {
-                    let [coarse, fine, instance] = base.steps.map(|steps| scaled(steps, factor));
-                    let [densify, resample] = base.until.map(|step| scaled(step, factor));
-                    let settings: Vec<String> = [
-                        format!("stages.coarse={coarse}"),
-                        format!("stages.fine={fine}"),
-                        format!("stages.instance={instance}"),
-                        format!("densify.until={densify}"),
-                        format!("resample.until={resample}"),
-                    ]
-                    .into();
-                    let label = format!("{} steps", coarse + fine + instance);
-                    let settings = if factor == 1.0 { &[][..] } else { &settings };
-                    train(&format!("iterations-{factor}"), label, settings)
-                })
-                .collect(),
-        ),
-        "resolution" => (
-            "Resolution",
-            "Training images reduced; scored on the images of the base all the same.",
-            factors(&[4.0, 2.0, 1.0], &[2.0, 1.0])
-                .into_iter()
-                .map(|factor| {
-                    let downscale = scaled(base.downscale, factor);
-                    let settings = [format!("downscale={downscale}")];
-                    let label = if factor == 1.0 { "full".to_owned() } else { format!("1/{factor}") };
-                    let settings = if factor == 1.0 { &[][..] } else { &settings };
-                    train(&format!("resolution-{factor}"), label, settings)
-                })
-                .collect(),
-        ),
-        "gaussians" => (
-            "Gaussians",
-            "The most Gaussians that densification may add up to, and no more points to begin with.",
-            factors(&[0.25, 0.5, 1.0, 2.0], &[0.5, 1.0, 2.0])
-                .into_iter()
-                .map(|factor| {
-                    let most = scaled(base.gaussians, factor);
-                    let settings = [
-                        format!("densify.max_gaussians={most}"),
-                        format!("model.max_initial_points={}", base.points.min(most)),
-                    ];
-                    let settings = if factor == 1.0 { &[][..] } else { &settings };
-                    train(&format!("gaussians-{factor}"), most.to_string(), settings)
-                })
-                .collect(),
-        ),
-        "deformation" => {
-            let nodes = |count: u32| format!("model.spatial_resolution=[{count},{count},{count}]");
-            let half = base.nodes / 2;
-            let width = |width: u32| format!("model.width={width}");
-            let mut rungs = vec![
-                train(
-                    "deformation-none",
-                    "none",
-                    &[
-                        format!("stages.coarse={}", base.steps[0] + base.steps[1]),
-                        "stages.fine=0".to_owned(),
-                        format!("rates.schedule_steps={}", base.steps.iter().sum::<u32>()),
-                    ],
-                ),
-                train(
-                    "deformation-small",
-                    format!("planes {half}, width {}", base.width / 2),
-                    &[nodes(half), width(base.width / 2)],
-                ),
-                train("deformation-planes-half", format!("planes {half}"), &[nodes(half)]),
-            ];
-            if !quick {
-                rungs.push(train("deformation-channels", "8 channels", &["model.channels=8".to_owned()]));
-            }
-            rungs.push(train("", format!("planes {}, width {}", base.nodes, base.width), &[]));
-            rungs.push(train(
-                "deformation-wide",
-                format!("width {}", base.width * 2),
-                &[width(base.width * 2)],
-            ));
-            (
-                "Deformation",
-                "Nodes of the feature planes and width of the network that move Gaussians.",
-                if base.is_dynamic { rungs } else { Vec::new() },
-            )
-        }
-        "sh" => (
-            "View-dependent colour",
-            "Highest degree of the spherical harmonics.",
-            (0..=base.sh_degree)
-                .filter(|degree| !quick || [0, 1, base.sh_degree].contains(degree))
-                .map(|degree| {
-                    let settings = [format!("model.sh_degree={degree}")];
-                    let settings = if degree == base.sh_degree { &[][..] } else { &settings };
-                    train(&format!("sh-{degree}"), format!("degree {degree}"), settings)
-                })
-                .collect(),
-        ),
-        "instance" => (
-            "Instance stage",
-            "Steps with instances, after one and the same reconstruction.",
-            if base.has_instances {
-                factors(&[0.2, 0.5, 1.0, 2.0], &[0.25, 1.0, 2.0])
-                    .into_iter()
-                    .map(|factor| {
-                        let steps = scaled(base.steps[2], factor);
-                        let until = scaled(base.until[1], factor);
-                        let settings =
-                            [format!("stages.instance={steps}"), format!("resample.until={until}")];
-                        let settings = if factor == 1.0 { &[][..] } else { &settings };
-                        train(&format!("instance-{factor}"), format!("{steps} steps"), settings)
-                    })
-                    .collect()
-            } else {
-                Vec::new()
-            },
-        ),
-        "speedups" => ("Approximations", "Settings that save or cost time in training, one by one.", {
-            let mut rungs = vec![train("", "none", &[])];
-            let one = |id: &str, label: &str, setting: &str| train(id, label, &[setting.to_owned()]);
-            if base.has_instances {
-                rungs.push(one("speedup-stride", "identities from every 4th frame", "identity.stride=4"));
-                rungs.push(if base.instances_move_geometry {
-                    one("geometry-off", "instances leave geometry alone", "instance.geometry=off")
-                } else {
-                    one("geometry-full", "instances move geometry", "instance.geometry=full")
-                });
-            }
-            rungs.push(one("speedup-visible", "only visible rows move", "adam.visible_rows_only=true"));
-            rungs
-        }),
-        "precision" => (
-            "Precision",
-            "One held-out frame of the base, rendered by the fast path in 32 bits and by the readable \
-             reference in 32 and 64 bits. The residual is the largest difference of a colour to 64 bits.",
-            vec![
-                rung(
-                    "precision-fast",
-                    "fast path, f32",
-                    Work::Render { reduction: 1, sh_degree: None, min_opacity: 0.0 },
-                ),
-                rung("precision-f32", "reference, f32", Work::Reference { double: false }),
-                rung("precision-f64", "reference, f64", Work::Reference { double: true }),
-            ],
-        ),
-        "storage" => (
-            "Storage",
-            "Parameters of the base rounded to 16-bit floats, then scored; bytes are those of the parameters.",
-            vec![
-                rung("storage-all", "all in f16", Work::Store { planes: true, splats: true, centres: true }),
-                rung(
-                    "storage-but-centres",
-                    "all but centres in f16",
-                    Work::Store { planes: true, splats: true, centres: false },
-                ),
-                rung(
-                    "storage-planes",
-                    "deformation in f16",
-                    Work::Store { planes: true, splats: false, centres: false },
-                ),
-                rung(
-                    "storage-f32",
-                    "all in f32",
-                    Work::Store { planes: false, splats: false, centres: false },
-                ),
-            ],
-        ),
-        "render" => (
-            "Rendering",
-            "Held-out frames of the base rendered with less. The residual is the largest difference of a \
-             colour to the final quality; seconds are those of a frame.",
-            vec![
-                rung(
-                    "render-half",
-                    "half size",
-                    Work::Render { reduction: 2, sh_degree: None, min_opacity: 0.0 },
-                ),
-                rung(
-                    "render-draft",
-                    "draft: opacity from 0.3",
-                    Work::Render { reduction: 1, sh_degree: None, min_opacity: DRAFT.min_opacity },
-                ),
-                rung(
-                    "render-opaque",
-                    "opacity from 0.1",
-                    Work::Render { reduction: 1, sh_degree: None, min_opacity: 0.1 },
-                ),
-                rung(
-                    "render-degree",
-                    "degree 1",
-                    Work::Render { reduction: 1, sh_degree: Some(1), min_opacity: 0.0 },
-                ),
-                rung(
-                    "render-final",
-                    "final",
-                    Work::Render { reduction: 1, sh_degree: None, min_opacity: 0.0 },
-                ),
-            ],
-        ),
-        _ => (
-            "Export tolerance",
-            "Motion of objects in a glTF file inside a tolerance, percent of each object's size. The residual is \
-             the largest decisive one, world units; bytes are those of the file, seconds those of building and \
-             writing it.",
-            [10.0, 3.0, 1.0, 0.3]
-                .into_iter()
-                .map(|percent| {
-                    rung(
-                        &format!("export-{percent}"),
-                        &format!("{percent} %"),
-                        Work::Export(Tolerance::Percent(percent)),
-                    )
-                })
-                .collect(),
-        ),
+        "presets" => presets(base),
+        PAPER => paper(base),
+        "iterations" => iterations(base),
+        "resolution" => resolution(base),
+        "gaussians" => gaussians(base),
+        "deformation" => deformation(base),
+        "sh" => sh(base),
+        "instance" => instance(base),
+        "speedups" => speedups(base),
+        "precision" => precision(),
+        "storage" => storage(),
+        "render" => render(),
+        _ => export(),
     };
     Ladder { name, title, about, rungs }
+}
+
+/// The factors of a ladder; fewer in a quick report.
+fn factors(base: &Base, all: &[f64], few: &[f64]) -> Vec<f64> {
+    if base.quick { few.to_vec() } else { all.to_vec() }
+}
+
+/// A setting of the base times a factor; at least 1.
+fn scaled(value: u32, factor: f64) -> u32 {
+    (f64::from(value) * factor).round().max(1.0) as u32
+}
+
+/// Named settings.
+fn presets(base: &Base) -> Parts {
+    let whole = |name| Work::Preset { name, share: 1.0, settings: Vec::new() };
+    let named = |name: &'static str| rung(&format!("preset-{name}"), name, whole(name));
+    let rungs = if base.quick {
+        vec![train("", "quick base", &[]), named("draft")]
+    } else {
+        vec![named("draft"), named("standard")]
+    };
+    ("Presets", "Named settings, all of them at once.", rungs)
+}
+
+/// The configuration of the paper.
+fn paper(base: &Base) -> Parts {
+    let rungs = base.paper.as_ref().map_or_else(Vec::new, |Paper { share, settings }| {
+        let percent = format!("{:.3}", 100.0 * share);
+        let percent = percent.trim_end_matches('0').trim_end_matches('.');
+        let label = match *share < 1.0 {
+            true => format!("paper, {percent} % of its steps"),
+            false => "paper".to_owned(),
+        };
+        let work = Work::Preset { name: PAPER, share: *share, settings: settings.clone() };
+        vec![train("", "base", &[]), rung(PAPER, &label, work)]
+    });
+    (
+        "The paper's configuration",
+        "The preset `paper` for the layout of the capture: batch, planes, network, losses, densification and rates \
+         as published. Where its row says so, it has a share of the published steps, with everything that counts in \
+         steps shortened alike, or the settings named there; without, it is whole.",
+        rungs,
+    )
+}
+
+/// Steps of all stages.
+fn iterations(base: &Base) -> Parts {
+    (
+        "Iterations",
+        "Steps of all stages, with everything that counts in steps stretched alike.",
+        factors(base, &[0.25, 0.5, 1.0, 2.0], &[0.5, 1.0, 2.0])
+            .into_iter()
+            .map(|factor| {
+                let [coarse, fine, instance] = base.steps.map(|steps| scaled(steps, factor));
+                let [densify, resample] = base.until.map(|step| scaled(step, factor));
+                let settings: Vec<String> = [
+                    format!("stages.coarse={coarse}"),
+                    format!("stages.fine={fine}"),
+                    format!("stages.instance={instance}"),
+                    format!("densify.until={densify}"),
+                    format!("resample.until={resample}"),
+                ]
+                .into();
+                let label = format!("{} steps", coarse + fine + instance);
+                let settings = if factor == 1.0 { &[][..] } else { &settings };
+                train(&format!("iterations-{factor}"), label, settings)
+            })
+            .collect(),
+    )
+}
+
+/// Size of the training images.
+fn resolution(base: &Base) -> Parts {
+    (
+        "Resolution",
+        "Training images reduced; scored on the images of the base all the same.",
+        factors(base, &[4.0, 2.0, 1.0], &[2.0, 1.0])
+            .into_iter()
+            .map(|factor| {
+                let downscale = scaled(base.downscale, factor);
+                let settings = [format!("downscale={downscale}")];
+                let label = if factor == 1.0 { "full".to_owned() } else { format!("1/{factor}") };
+                let settings = if factor == 1.0 { &[][..] } else { &settings };
+                train(&format!("resolution-{factor}"), label, settings)
+            })
+            .collect(),
+    )
+}
+
+/// Number of Gaussians.
+fn gaussians(base: &Base) -> Parts {
+    (
+        "Gaussians",
+        "The most Gaussians that densification may add up to, and no more points to begin with.",
+        factors(base, &[0.25, 0.5, 1.0, 2.0], &[0.5, 1.0, 2.0])
+            .into_iter()
+            .map(|factor| {
+                let most = scaled(base.gaussians, factor);
+                let settings = [
+                    format!("densify.max_gaussians={most}"),
+                    format!("model.max_initial_points={}", base.points.min(most)),
+                ];
+                let settings = if factor == 1.0 { &[][..] } else { &settings };
+                train(&format!("gaussians-{factor}"), most.to_string(), settings)
+            })
+            .collect(),
+    )
+}
+
+/// Size of the deformation.
+fn deformation(base: &Base) -> Parts {
+    let nodes = |count: u32| format!("model.spatial_resolution=[{count},{count},{count}]");
+    let half = base.nodes / 2;
+    let width = |width: u32| format!("model.width={width}");
+    let mut rungs = vec![
+        train(
+            "deformation-none",
+            "none",
+            &[
+                format!("stages.coarse={}", base.steps[0] + base.steps[1]),
+                "stages.fine=0".to_owned(),
+                format!("rates.schedule_steps={}", base.steps.iter().sum::<u32>()),
+            ],
+        ),
+        train(
+            "deformation-small",
+            format!("planes {half}, width {}", base.width / 2),
+            &[nodes(half), width(base.width / 2)],
+        ),
+        train("deformation-planes-half", format!("planes {half}"), &[nodes(half)]),
+    ];
+    if !base.quick {
+        rungs.push(train("deformation-channels", "8 channels", &["model.channels=8".to_owned()]));
+    }
+    rungs.push(train("", format!("planes {}, width {}", base.nodes, base.width), &[]));
+    rungs.push(train("deformation-wide", format!("width {}", base.width * 2), &[width(base.width * 2)]));
+    (
+        "Deformation",
+        "Nodes of the feature planes and width of the network that move Gaussians.",
+        if base.is_dynamic { rungs } else { Vec::new() },
+    )
+}
+
+/// Degree of the colours.
+fn sh(base: &Base) -> Parts {
+    (
+        "View-dependent colour",
+        "Highest degree of the spherical harmonics.",
+        (0..=base.sh_degree)
+            .filter(|degree| !base.quick || [0, 1, base.sh_degree].contains(degree))
+            .map(|degree| {
+                let settings = [format!("model.sh_degree={degree}")];
+                let settings = if degree == base.sh_degree { &[][..] } else { &settings };
+                train(&format!("sh-{degree}"), format!("degree {degree}"), settings)
+            })
+            .collect(),
+    )
+}
+
+/// Steps of the instance stage.
+fn instance(base: &Base) -> Parts {
+    (
+        "Instance stage",
+        "Steps with instances, after one and the same reconstruction.",
+        if base.has_instances {
+            factors(base, &[0.2, 0.5, 1.0, 2.0], &[0.25, 1.0, 2.0])
+                .into_iter()
+                .map(|factor| {
+                    let steps = scaled(base.steps[2], factor);
+                    let until = scaled(base.until[1], factor);
+                    let settings = [format!("stages.instance={steps}"), format!("resample.until={until}")];
+                    let settings = if factor == 1.0 { &[][..] } else { &settings };
+                    train(&format!("instance-{factor}"), format!("{steps} steps"), settings)
+                })
+                .collect()
+        } else {
+            Vec::new()
+        },
+    )
+}
+
+/// Approximations.
+fn speedups(base: &Base) -> Parts {
+    ("Approximations", "Settings that save or cost time in training, one by one.", {
+        let mut rungs = vec![train("", "none", &[])];
+        let one = |id: &str, label: &str, setting: &str| train(id, label, &[setting.to_owned()]);
+        if base.has_instances {
+            rungs.push(one("speedup-stride", "identities from every 4th frame", "identity.stride=4"));
+            rungs.push(if base.instances_move_geometry {
+                one("geometry-off", "instances leave geometry alone", "instance.geometry=off")
+            } else {
+                one("geometry-full", "instances move geometry", "instance.geometry=full")
+            });
+        }
+        rungs.push(one("speedup-visible", "only visible rows move", "adam.visible_rows_only=true"));
+        rungs
+    })
+}
+
+/// Precision of rendering.
+fn precision() -> Parts {
+    (
+        "Precision",
+        "One held-out frame of the base, rendered by the fast path in 32 bits and by the readable \
+         reference in 32 and 64 bits. The residual is the largest difference of a colour to 64 bits.",
+        vec![
+            rung(
+                "precision-fast",
+                "fast path, f32",
+                Work::Render { reduction: 1, sh_degree: None, min_opacity: 0.0 },
+            ),
+            rung("precision-f32", "reference, f32", Work::Reference { double: false }),
+            rung("precision-f64", "reference, f64", Work::Reference { double: true }),
+        ],
+    )
+}
+
+/// Precision of stored parameters.
+fn storage() -> Parts {
+    (
+        "Storage",
+        "Parameters of the base rounded to 16-bit floats, then scored; bytes are those of the parameters.",
+        vec![
+            rung("storage-all", "all in f16", Work::Store { planes: true, splats: true, centres: true }),
+            rung(
+                "storage-but-centres",
+                "all but centres in f16",
+                Work::Store { planes: true, splats: true, centres: false },
+            ),
+            rung(
+                "storage-planes",
+                "deformation in f16",
+                Work::Store { planes: true, splats: false, centres: false },
+            ),
+            rung("storage-f32", "all in f32", Work::Store { planes: false, splats: false, centres: false }),
+        ],
+    )
+}
+
+/// Quality of rendering.
+fn render() -> Parts {
+    (
+        "Rendering",
+        "Held-out frames of the base rendered with less. The residual is the largest difference of a \
+         colour to the final quality; seconds are those of a frame.",
+        vec![
+            rung(
+                "render-half",
+                "half size",
+                Work::Render { reduction: 2, sh_degree: None, min_opacity: 0.0 },
+            ),
+            rung(
+                "render-draft",
+                "draft: opacity from 0.3",
+                Work::Render { reduction: 1, sh_degree: None, min_opacity: DRAFT.min_opacity },
+            ),
+            rung(
+                "render-opaque",
+                "opacity from 0.1",
+                Work::Render { reduction: 1, sh_degree: None, min_opacity: 0.1 },
+            ),
+            rung(
+                "render-degree",
+                "degree 1",
+                Work::Render { reduction: 1, sh_degree: Some(1), min_opacity: 0.0 },
+            ),
+            rung("render-final", "final", Work::Render { reduction: 1, sh_degree: None, min_opacity: 0.0 }),
+        ],
+    )
+}
+
+/// Tolerance of exported motion.
+fn export() -> Parts {
+    (
+        "Export tolerance",
+        "Motion of objects in a glTF file inside a tolerance, percent of each object's size. The residual is \
+         the largest decisive one, world units; bytes are those of the file, seconds those of building and \
+         writing it.",
+        [10.0, 3.0, 1.0, 0.3]
+            .into_iter()
+            .map(|percent| {
+                rung(
+                    &format!("export-{percent}"),
+                    &format!("{percent} %"),
+                    Work::Export(Tolerance::Percent(percent)),
+                )
+            })
+            .collect(),
+    )
 }
 
 #[cfg(test)]

@@ -54,7 +54,7 @@ pub fn train(
     folder: &Records<Record>,
     training: Training<'_>,
     stop: &Stop,
-    tell: &mut dyn FnMut(u64, u64),
+    progress: &mut dyn FnMut(u64, u64),
 ) -> Result<Option<(Field, Record)>, Error> {
     let run = Run {
         partial: &folder.file(&format!("{}.partial.cif", training.id)),
@@ -63,7 +63,7 @@ pub fn train(
         until: None,
     };
     let begin = |start: Start| Trainer::new(start, training.config.clone());
-    let Some(trainer) = run.train(&begin, stop, tell)? else { return Ok(None) };
+    let Some(trainer) = run.train(&begin, stop, progress)? else { return Ok(None) };
     let (curve, spent) = (trainer.curve().clone(), trainer.time_of_training());
     let field = trainer.into_field();
     let run = field.record.run.clone().unwrap_or_default();

@@ -1,4 +1,4 @@
-//! Cost of accuracy: one scene trained, stored, rendered and exported in many ways, and the report of it.
+//! Cost of accuracy: one scene trained, stored, rendered and exported with many settings, and the report of it.
 //!
 //! | file | answers |
 //! |---|---|

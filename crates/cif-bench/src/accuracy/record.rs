@@ -43,7 +43,7 @@ pub struct Record {
     pub settings: Vec<String>,
     /// The run's own curve.
     pub curve: Option<Curve>,
-    /// Pictures beside the record, without folder.
+    /// Pictures next to the record, without folder.
     pub pictures: Vec<String>,
 }
 

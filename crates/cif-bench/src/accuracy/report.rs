@@ -3,9 +3,11 @@
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
+use serde::ser::Error as _;
+use serde::{Serialize, Serializer};
 use serde_json::{Value, json};
 
-use super::ladders::{BASE, Ladder, Work};
+use super::ladders::{BASE, Ladder, Rung, Work};
 use super::pareto::{Climb, amount, front, sentence};
 use super::record::Record;
 use crate::error::{Error, write_file};
@@ -35,7 +37,7 @@ pub struct Subject {
 /// Motion of the objects of a scene.
 #[derive(Clone, Debug, Default)]
 pub struct Motion {
-    /// Scores against known motion; null where it is not known.
+    /// Scores against known motion, JSON; null where it is not known.
     pub scores: Value,
     /// Headings of their table.
     pub headings: Vec<&'static str>,
@@ -149,40 +151,82 @@ pub fn write(
     for (name, _, text) in &plots {
         write_file(&folder.join(format!("{name}.svg")), text.as_bytes())?;
     }
-    write_file(&folder.join("report.json"), format!("{:#}\n", json_of(subject, &rows)).as_bytes())?;
+    write_file(&folder.join("report.json"), format!("{:#}\n", json!(report_of(subject, &rows))).as_bytes())?;
     write_file(&folder.join("rungs.csv"), csv(&rows).as_bytes())?;
     let page = page(rungs, subject, measured, &rows, &plots)?;
     write_file(&folder.join("report.html"), page.as_bytes())
 }
 
-fn json_of(subject: &Subject, rows: &[Row<'_>]) -> Value {
-    let rungs: Vec<Value> = rows
-        .iter()
-        .map(|row| {
-            let mut value = json!(row.record);
-            if let Some(table) = value.as_object_mut() {
-                table.remove("fingerprint");
-                table.remove("pictures");
-            }
-            value["ladder"] = json!(row.ladder.name);
-            value["rung"] = json!(row.label);
-            value["id"] = json!(row.id);
-            value["front_psnr"] = json!(row.front[0]);
-            value["front_iou"] = json!(row.front[1]);
-            value["climb"] = json!(row.climb);
-            value
-        })
-        .collect();
-    json!({
-        "capture": subject.capture,
-        "description": subject.description,
-        "command": subject.command,
-        "threads": subject.threads,
-        "simd": subject.simd,
-        "rungs_missing": subject.missing,
-        "motion": subject.motion.as_ref().map(|motion| &motion.scores),
-        "rungs": rungs,
-    })
+/// Ladders of accuracy.
+#[derive(Serialize)]
+pub struct AccuracyReport<'a> {
+    /// Name of the capture.
+    capture: &'a str,
+    /// One line on it.
+    description: &'a str,
+    /// Command that made the report.
+    command: &'a str,
+    /// Threads.
+    threads: usize,
+    /// Vector instructions.
+    simd: &'a str,
+    /// Rungs that are not measured yet.
+    rungs_missing: usize,
+    /// Motion of the objects of the base, as `motion` of `cif eval`; null where it is not known.
+    motion: Option<&'a Value>,
+    /// Every rung that was measured.
+    rungs: Vec<RungReport<'a>>,
+}
+
+/// A rung.
+#[derive(Serialize)]
+struct RungReport<'a> {
+    #[serde(flatten, serialize_with = "without_bookkeeping")]
+    record: &'a Record,
+    /// Name of the ladder.
+    ladder: &'a str,
+    /// Name of the rung.
+    rung: &'a str,
+    /// Name of its files.
+    id: &'a str,
+    /// True where nothing measured costs less and has a higher PSNR.
+    front_psnr: bool,
+    /// True where nothing measured costs less and has a higher IoU.
+    front_iou: bool,
+    /// Cost and gain against the rung below, in words; null for the lowest.
+    climb: Option<&'a str>,
+}
+
+/// A record without the fields that only its own file needs.
+fn without_bookkeeping<S: Serializer>(record: &&Record, serializer: S) -> Result<S::Ok, S::Error> {
+    let mut value = serde_json::to_value(record).map_err(S::Error::custom)?;
+    if let Some(table) = value.as_object_mut() {
+        table.remove("fingerprint");
+        table.remove("pictures");
+    }
+    value.serialize(serializer)
+}
+
+fn report_of<'a>(subject: &'a Subject, rows: &'a [Row<'_>]) -> AccuracyReport<'a> {
+    let rung = |row: &'a Row<'_>| RungReport {
+        record: row.record,
+        ladder: row.ladder.name,
+        rung: row.label,
+        id: row.id,
+        front_psnr: row.front[0],
+        front_iou: row.front[1],
+        climb: row.climb.as_deref(),
+    };
+    AccuracyReport {
+        capture: &subject.capture,
+        description: &subject.description,
+        command: &subject.command,
+        threads: subject.threads,
+        simd: &subject.simd,
+        rungs_missing: subject.missing,
+        motion: subject.motion.as_ref().map(|motion| &motion.scores),
+        rungs: rows.iter().map(rung).collect(),
+    }
 }
 
 fn csv(rows: &[Row<'_>]) -> String {
@@ -217,111 +261,115 @@ fn csv(rows: &[Row<'_>]) -> String {
     text
 }
 
+/// Value of a record that a plot shows.
+type Plotted = fn(&Record) -> Option<f64>;
+
 /// File name, caption and SVG of every plot; the overviews first.
 fn plots(measured: &Measured, rows: &[Row<'_>]) -> Vec<(String, String, String)> {
-    let mut found = Vec::new();
-    let mut add = |name: String, caption: String, plot: &Plot<'_>| {
-        if let Some(text) = svg(plot) {
-            found.push((name, caption, text));
-        }
-    };
-    type Value = fn(&Record) -> Option<f64>;
-    let overviews: [(&str, &str, Value, usize); 2] = [
+    let overviews: [(&str, &str, Plotted, usize); 2] = [
         ("psnr", "PSNR of held-out frames, dB", |record| record.psnr, 0),
         ("iou", "IoU of held-out frames over the whole image, %", |record| record.iou, 1),
     ];
-    for (name, axis, value, which) in overviews {
-        let series: Vec<Series> = measured
-            .iter()
-            .filter(|(ladder, _)| kind(ladder) == Kind::Train)
-            .map(|(ladder, _)| Series {
-                name: ladder.title.to_owned(),
-                points: rows
-                    .iter()
-                    .filter(|row| row.ladder.name == ladder.name)
-                    .filter_map(|row| {
-                        // The base stands in most ladders; it is named once.
-                        let named = row.front[which] && (row.id != BASE || ladder.name == "iterations");
-                        let name = if named { row.label.to_owned() } else { String::new() };
-                        Some((row.record.cpu_s, value(row.record)?, name))
-                    })
-                    .collect(),
-                line: false,
-            })
-            .filter(|series| !series.points.is_empty())
-            .collect();
-        let mut front: Vec<(f64, f64)> = rows
-            .iter()
-            .filter(|row| row.front[which])
-            .filter_map(|row| Some((row.record.cpu_s, value(row.record)?)))
-            .collect();
-        front.sort_by(|a, b| a.0.total_cmp(&b.0));
-        front.dedup();
-        let plot = Plot {
-            axes: ["processor time of training, s (all threads together)", axis],
-            log: true,
-            series,
-            front,
-            size: (900, 470),
-        };
-        add(
-            format!("overview-{name}"),
-            format!(
-                "Every trained rung: {axis}, against processor time. The dashed line joins what nothing else beats; \
-                 its rungs are named."
-            ),
-            &plot,
+    let overviews = overviews.into_iter().filter_map(|(name, axis, value, which)| {
+        let caption = format!(
+            "Every trained rung: {axis}, against processor time. The dashed line joins what nothing else beats; \
+             its rungs are named."
         );
-    }
-    for (ladder, records) in measured {
-        let present = || ladder.rungs.iter().zip(records).filter_map(|(rung, r)| Some((rung, r.as_ref()?)));
-        match kind(ladder) {
+        Some((format!("overview-{name}"), caption, svg(&overview(measured, rows, axis, value, which))?))
+    });
+    let of_ladders = measured.iter().filter_map(|(ladder, records)| {
+        let records: Vec<(&Rung, &Record)> =
+            ladder.rungs.iter().zip(records).filter_map(|(rung, r)| Some((rung, r.as_ref()?))).collect();
+        let (caption, plot) = match kind(ladder) {
             Kind::Train => {
-                let series = present()
-                    .filter_map(|(rung, record)| {
-                        let curve = record.curve.as_ref()?;
-                        let points = curve.points.iter();
-                        let points = points.filter_map(|p| Some((p.cpu_s, p.psnr?, String::new()))).collect();
-                        Some(Series { name: rung.label.clone(), points, line: true })
-                    })
-                    .collect();
-                let plot = Plot {
-                    axes: ["processor time, s", "PSNR of the curve's frames, dB"],
-                    log: false,
-                    series,
-                    front: Vec::new(),
-                    size: (640, 340),
-                };
                 let caption = "Quality while training went on, each rung measured on a few held-out frames.";
-                add(format!("ladder-{}", ladder.name), caption.to_owned(), &plot);
+                (caption, curves(&records))
             }
-            kind => {
-                let (axes, value): ([&str; 2], Value) = match kind {
-                    Kind::Export => {
-                        (["size of the file, kB", "largest residual, world units"], |record| record.residual)
-                    }
-                    Kind::Bytes => {
-                        (["size of the parameters, kB", "PSNR of held-out frames, dB"], |r| r.psnr)
-                    }
-                    _ => (["processor time of a frame, ms", "PSNR of held-out frames, dB"], |record| {
-                        record.psnr
-                    }),
-                };
-                // Both bytes and seconds are shown in thousands or thousandths.
-                let scale = if kind == Kind::Frame { 1e3 } else { 1e-3 };
-                let points = present()
-                    .filter_map(|(rung, record)| {
-                        Some((scale * cost(kind, record).0, value(record)?, rung.label.clone()))
-                    })
-                    .collect();
-                let series = vec![Series { name: ladder.title.to_owned(), points, line: false }];
-                let log = kind == Kind::Frame;
-                let plot = Plot { axes, log, series, front: Vec::new(), size: (640, 300) };
-                add(format!("ladder-{}", ladder.name), "What accuracy costs here.".to_owned(), &plot);
-            }
-        }
+            kind => ("What accuracy costs here.", costs(ladder, kind, &records)),
+        };
+        Some((format!("ladder-{}", ladder.name), caption.to_owned(), svg(&plot)?))
+    });
+    overviews.chain(of_ladders).collect()
+}
+
+/// A value of every trained rung against processor time, with the front of the best; `which` is the column of fronts.
+fn overview<'a>(
+    measured: &Measured,
+    rows: &[Row<'_>],
+    axis: &'a str,
+    value: Plotted,
+    which: usize,
+) -> Plot<'a> {
+    let series: Vec<Series> = measured
+        .iter()
+        .filter(|(ladder, _)| kind(ladder) == Kind::Train)
+        .map(|(ladder, _)| Series {
+            name: ladder.title.to_owned(),
+            points: rows
+                .iter()
+                .filter(|row| row.ladder.name == ladder.name)
+                .filter_map(|row| {
+                    // The base is in most ladders; it is named once.
+                    let named = row.front[which] && (row.id != BASE || ladder.name == "iterations");
+                    let name = if named { row.label.to_owned() } else { String::new() };
+                    Some((row.record.cpu_s, value(row.record)?, name))
+                })
+                .collect(),
+            line: false,
+        })
+        .filter(|series| !series.points.is_empty())
+        .collect();
+    let mut front: Vec<(f64, f64)> = rows
+        .iter()
+        .filter(|row| row.front[which])
+        .filter_map(|row| Some((row.record.cpu_s, value(row.record)?)))
+        .collect();
+    front.sort_by(|a, b| a.0.total_cmp(&b.0));
+    front.dedup();
+    Plot {
+        axes: ["processor time of training, s (all threads together)", axis],
+        log: true,
+        series,
+        front,
+        size: (900, 470),
     }
-    found
+}
+
+/// The curves of trained rungs.
+fn curves(records: &[(&Rung, &Record)]) -> Plot<'static> {
+    let series = records
+        .iter()
+        .filter_map(|(rung, record)| {
+            let curve = record.curve.as_ref()?;
+            let points = curve.points.iter();
+            let points = points.filter_map(|p| Some((p.cpu_s, p.psnr?, String::new()))).collect();
+            Some(Series { name: rung.label.clone(), points, line: true })
+        })
+        .collect();
+    Plot {
+        axes: ["processor time, s", "PSNR of the curve's frames, dB"],
+        log: false,
+        series,
+        front: Vec::new(),
+        size: (640, 340),
+    }
+}
+
+/// Accuracy against cost of rungs that nothing is trained for.
+fn costs(ladder: &Ladder, kind: Kind, records: &[(&Rung, &Record)]) -> Plot<'static> {
+    let (axes, value): ([&str; 2], Plotted) = match kind {
+        Kind::Export => (["size of the file, kB", "largest residual, world units"], |record| record.residual),
+        Kind::Bytes => (["size of the parameters, kB", "PSNR of held-out frames, dB"], |r| r.psnr),
+        _ => (["processor time of a frame, ms", "PSNR of held-out frames, dB"], |record| record.psnr),
+    };
+    // Both bytes and seconds are shown in thousands or thousandths.
+    let scale = if kind == Kind::Frame { 1e3 } else { 1e-3 };
+    let points = records
+        .iter()
+        .filter_map(|(rung, record)| Some((scale * cost(kind, record).0, value(record)?, rung.label.clone())))
+        .collect();
+    let series = vec![Series { name: ladder.title.to_owned(), points, line: false }];
+    Plot { axes, log: kind == Kind::Frame, series, front: Vec::new(), size: (640, 300) }
 }
 
 fn page(
@@ -340,7 +388,7 @@ fn page(
         simd: &subject.simd,
         command: &subject.command,
         missing: (subject.missing > 0).then(|| {
-            format!("{} rungs are not measured yet; the same command goes on with them.", subject.missing)
+            format!("{} rungs are not measured yet; run the same command again for them.", subject.missing)
         }),
     });
     page += "<nav>";
@@ -411,7 +459,7 @@ fn motion_section(page: &mut String, motion: &Motion) -> Result<(), Error> {
     }
     if let Some(path) = &motion.picture {
         page.push_str("<div class=\"pictures\">\n");
-        picture(page, path, "paths of the objects of the base, the way to come fainter")?;
+        picture(page, path, "paths of the objects of the base, fainter after the shown time")?;
         page.push_str("</div>\n");
     }
     page.push_str("</section>\n");
@@ -423,8 +471,7 @@ const SUMMARY_OPEN: &str = "<section id=\"summary\">\n<h2>In short</h2>\n<ul cla
 /// The front from cheap to dear, in sentences.
 fn summary(rows: &[Row<'_>]) -> Vec<String> {
     let mut lines = Vec::new();
-    type Value = fn(&Record) -> Option<f64>;
-    let values: [(&str, &str, Value); 2] =
+    let values: [(&str, &str, Plotted); 2] =
         [("PSNR", "dB", |record| record.psnr), ("IoU", "%", |record| record.iou)];
     for (which, (name, unit, value)) in values.into_iter().enumerate() {
         let mut on_front: Vec<&Row<'_>> = rows.iter().filter(|row| row.front[which]).collect();

@@ -1,4 +1,4 @@
-//! The tables of the paper: how the method fares beside other systems, and without its parts, on one reconstruction per
+//! The tables of the paper: the method compared with other systems, and without its parts, on one reconstruction per
 //! capture and seed.
 //!
 //! | file | answers |

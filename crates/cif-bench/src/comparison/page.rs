@@ -120,13 +120,13 @@ fn page(
 ) -> Result<String, Error> {
     let mut page = open(&Header {
         title: "Comparison",
-        heading: "The method beside others, on one reconstruction",
+        heading: "The method compared with others, on one reconstruction",
         description: &comparison.description,
         threads: comparison.threads,
         simd: &comparison.simd,
         command: &comparison.command,
         missing: (!comparison.missing.is_empty()).then(|| {
-            format!("{} runs are not done yet; the same command goes on with them.", comparison.missing.len())
+            format!("{} runs are missing; run the same command again for them.", comparison.missing.len())
         }),
     });
     page += "</header>\n<main>\n";
@@ -190,7 +190,7 @@ fn answers(page: &mut String, queries: &Queries) {
         let headings = escaped.iter().map(String::as_str);
         let headings = ["", "by"].into_iter().chain(headings).chain([PUBLISHED_HEADING]);
         let rows = table.lines.iter().map(|line| {
-            let row = [escape(&line.title), line.way.name().to_owned()].into_iter();
+            let row = [escape(&line.title), line.rule.name().to_owned()].into_iter();
             let row = row.chain(line.cells.iter().map(shown).map(cell));
             ("", row.chain([escape(&line.published)]).collect())
         });
@@ -299,7 +299,7 @@ fn pictures(
 
 #[cfg(test)]
 mod tests {
-    use super::super::queries::{Answer, Way};
+    use super::super::queries::{Answer, Rule};
     use super::super::record::Row;
     use super::*;
 
@@ -347,7 +347,7 @@ mod tests {
                     head: "cif".into(),
                     seed: 0,
                     question: "what is <red>?".into(),
-                    by: Way::Labels,
+                    by: Rule::Labels,
                     macc: Some(98.5),
                     miou: Some(76.25),
                     frames: 2,
@@ -365,7 +365,7 @@ mod tests {
         let page = text("compare.html");
         for part in [
             "table &lt;1&gt;",
-            "1 runs are not done yet",
+            "1 runs are missing",
             "table &lt;1&gt; with VLGS (re-implementation) (seed 1)",
             "VLGS (re-implementation)",
             "(i) constant occupancy",

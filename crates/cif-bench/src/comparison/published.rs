@@ -1,4 +1,4 @@
-//! Published numbers. They were taken against other masks: beside ours they tell the order of systems at most.
+//! Published numbers. They were taken against other masks: next to ours they give the order of systems at most.
 
 use std::collections::BTreeMap;
 use std::sync::LazyLock;
@@ -57,7 +57,7 @@ pub(super) struct PublishedTables {
 pub(super) static PUBLISHED: LazyLock<PublishedTables> =
     LazyLock::new(|| serde_json::from_str(include_str!("published.json")).expect("data of this crate"));
 
-/// What is known of the scene that a capture is called after.
+/// Published numbers of the scene that a capture is named after.
 fn of_scene<'a, T>(scenes: &'a BTreeMap<String, T>, capture: &str) -> Option<&'a T> {
     let plain = |name: &str| name.to_lowercase().replace(['-', '_', ' '], "");
     scenes.iter().find(|(scene, _)| plain(scene) == plain(capture)).map(|(_, known)| known)

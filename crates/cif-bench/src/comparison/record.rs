@@ -1,4 +1,4 @@
-//! Record of a run, beside its pictures and its scene.
+//! Record of a run, next to its pictures and its scene.
 
 use cif_dataset::MadeFrom;
 use serde::{Deserialize, Serialize};
@@ -44,7 +44,7 @@ pub struct Record {
     pub row: Row,
     /// Steps of the instance stage.
     pub steps: u64,
-    /// Pictures beside the record, without folder: colours, labels and true labels of a frame.
+    /// Pictures next to the record, without folder: colours, labels and true labels of a frame.
     pub pictures: Vec<String>,
 }
 

@@ -62,7 +62,7 @@ impl Subject<'_> {
         &self,
         runs: &Records<Record>,
         stop: &Stop,
-        tell: &mut dyn FnMut(u64, u64),
+        progress: &mut dyn FnMut(u64, u64),
     ) -> Result<Option<Checkpoint>, Error> {
         let path = runs.file(&format!("{}.cif", self.id()));
         let known = runs.file(&format!("{}.settings.json", self.id()));
@@ -80,7 +80,7 @@ impl Subject<'_> {
             until: Some(Stage::Identity),
         };
         let begin = |start: Start| Trainer::new(start, self.config.clone());
-        let Some(trainer) = run.train(&begin, stop, tell)? else { return Ok(None) };
+        let Some(trainer) = run.train(&begin, stop, progress)? else { return Ok(None) };
         if trainer.stage() != Stage::Identity {
             return Err(Error::plain(format!(
                 "{}: no training frame has a labelled pixel, so there is nothing to compare",
@@ -105,7 +105,7 @@ impl Subject<'_> {
         (id, config): (&str, &TrainConfig),
         reconstruction: &Checkpoint,
         stop: &Stop,
-        (tell, draw): (&mut dyn FnMut(u64, u64), Draw<'_>),
+        (progress, draw): (&mut dyn FnMut(u64, u64), Draw<'_>),
     ) -> Result<Option<Record>, Error> {
         let run = Run {
             partial: &runs.file(&format!("{id}.partial.cif")),
@@ -115,7 +115,7 @@ impl Subject<'_> {
         };
         let base = format!("{}.cif", self.id());
         let begin = |start: Start| Trainer::from_scene(start, config.clone(), reconstruction.clone(), &base);
-        let Some(trainer) = run.train(&begin, stop, tell)? else { return Ok(None) };
+        let Some(trainer) = run.train(&begin, stop, progress)? else { return Ok(None) };
         let scene = trainer.checkpoint(false);
         scene.save(runs.file(&format!("{id}.cif"))).map_err(Error::plain)?;
         let (field, decoder) = (&scene.field, trainer.decoder());
@@ -126,7 +126,7 @@ impl Subject<'_> {
             if Some(&view.frame.name) != shown.as_ref() {
                 return Ok(());
             }
-            // Pixels that are mostly background have no label in pictures; what decodes pixels tells that itself.
+            // Pixels that are mostly background have no label in pictures; decoders of pixels decide that themselves.
             let rendered = view.rendered.instances.as_ref().filter(|_| decoder.is_none());
             let shown = rendered.map(|instances| mask_ids(field, &instances.foreground_label()));
             let view = FrameView { predicted: shown.as_ref().or(view.predicted), ..view };

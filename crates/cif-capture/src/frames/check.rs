@@ -1,8 +1,10 @@
-//! Reasons why images cannot become a capture, told before work is put into them.
+//! Reasons why images cannot become a capture, reported before work is put into them.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::Shot;
+use cif_geometry::stats::upper_median;
+
+use super::shot::Shot;
 use crate::Error;
 
 /// Oddities that do not stop a capture, one sentence each.
@@ -87,8 +89,7 @@ pub fn check(shots: &[Shot], fixed: bool, notes: &mut Notes) -> Result<(), Error
             ));
         }
         let mut sharpness: Vec<f64> = shots.iter().map(|shot| shot.impression.sharpness).collect();
-        sharpness.sort_by(f64::total_cmp);
-        let median = sharpness[sharpness.len() / 2];
+        let median = upper_median(&mut sharpness).unwrap_or(0.0);
         let blurred: Vec<String> = shots
             .iter()
             .filter(|shot| shot.impression.sharpness < BLURRED * median)

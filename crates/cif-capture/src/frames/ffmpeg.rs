@@ -41,7 +41,7 @@ pub(super) fn run<T: Send>(
     // `-fps_mode` is known from 5.1 on, `-vsync` until 7.
     for mode in ["-fps_mode", "-vsync"] {
         let mut command = Command::new(program);
-        // Levels of lines tell errors from the rest; colours of terminals would be in the way.
+        // Levels of lines separate errors from the rest; colours of terminals would be in the way.
         command.env("AV_LOG_FORCE_NOCOLOR", "1").env_remove("AV_LOG_FORCE_COLOR");
         command.args(["-nostdin", "-hide_banner", "-nostats", "-loglevel", "level+info", "-i"]);
         command.arg(&name).args(["-an", "-sn", "-dn", "-vf", filter, mode, "passthrough"]);
@@ -125,7 +125,7 @@ mod tests {
     fn the_first_causes_are_shown() {
         let source = Source { camera: "a".into(), path: "walk.mp4".into(), photographs: None };
         let errors = ["moov atom not found", "moov atom not found", "b", "c", "d"].map(str::to_owned);
-        let told = failed(&source, &errors).to_string();
-        assert!(told.ends_with("ffmpeg fails: moov atom not found; b; c"), "{told}");
+        let message = failed(&source, &errors).to_string();
+        assert!(message.ends_with("ffmpeg fails: moov atom not found; b; c"), "{message}");
     }
 }

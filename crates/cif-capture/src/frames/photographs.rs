@@ -8,7 +8,9 @@ use cif_dataset::FrameSource;
 use cif_dataset::orientation::Orientation;
 use rayon::prelude::*;
 
-use super::{Choice, Notes, Shot};
+use super::check::Notes;
+use super::choose::Choice;
+use super::shot::Shot;
 use crate::picture::{Impression, Photograph};
 use crate::source::Source;
 use crate::{Error, Hooks};
@@ -30,7 +32,7 @@ pub(super) fn read(
             source.path.display()
         ));
     }
-    hooks.tell(&format!("photographs of {}", source.camera));
+    hooks.say(&format!("photographs of {}", source.camera));
     // Evenly spread, as of a video.
     let files: Vec<&PathBuf> = match choice.count.filter(|count| *count < files.len()) {
         Some(count) => (0..count).map(|k| &files[k * files.len() / count]).collect(),
@@ -80,10 +82,10 @@ pub(super) fn read(
     Ok(shots)
 }
 
-/// File beside frames that were kept of videos: the recordings that they were made of, by file name.
+/// File next to frames that were kept of videos: the recordings that they were made of, by file name.
 const SOURCES: &str = "sources.json";
 
-/// Writes the recordings of images beside them, so that [`read`] finds them.
+/// Writes the recordings of images next to them, so that [`read`] finds them.
 ///
 /// # Errors
 /// When the file system refuses.
@@ -205,9 +207,9 @@ mod tests {
         let source = Source { camera: "walk".into(), path: folder.path().into(), photographs: None };
         let into = folder.path().join("frames");
         let read = read(&source, &[path], "", &Choice::default(), &into, &Hooks::silent(), &mut Notes::new());
-        let told = read.unwrap_err().to_string();
-        assert!(told.contains("control characters") && told.contains("\\u{1b}"), "{told}");
-        assert!(!told.contains('\u{1b}'), "{told:?}");
+        let message = read.unwrap_err().to_string();
+        assert!(message.contains("control characters") && message.contains("\\u{1b}"), "{message}");
+        assert!(!message.contains('\u{1b}'), "{message:?}");
     }
 
     #[test]
@@ -242,8 +244,8 @@ mod tests {
         }
         assert_eq!(shots[2].file, files[2], "small ones stay where they are");
         assert_eq!(shots[0].name, "a.jpg");
-        let told = shots[0].source.as_ref().unwrap();
-        assert_eq!((told.file.as_str(), told.size, told.video), ("a.jpg", [200, 120], None));
+        let source = shots[0].source.as_ref().unwrap();
+        assert_eq!((source.file.as_str(), source.size, source.video), ("a.jpg", [200, 120], None));
         let mut reduced = ImageReader::open(&shots[0].file).unwrap().into_decoder().unwrap();
         assert_eq!(reduced.exif_metadata().unwrap(), Some(exif));
         assert_eq!(image::image_dimensions(&files[0]).unwrap(), (200, 120), "the original is left alone");

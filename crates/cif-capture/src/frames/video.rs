@@ -7,14 +7,17 @@ use std::sync::{Mutex, PoisonError, mpsc};
 
 use cif_dataset::orientation::Orientation;
 use cif_dataset::{FrameSource, VideoFrame};
+use cif_geometry::stats::upper_median;
 use image::ImageEncoder;
 use image::codecs::png::PngEncoder;
 
 use super::bt2100::{Conversion, Primaries, Transfer};
-use super::choose::{Seen, choose};
+use super::check::Notes;
+use super::choose::{Choice, Seen, choose};
+use super::ffmpeg;
 use super::ffmpeg::Pass;
 use super::pixmap::{self, Pixmap, Samples};
-use super::{Choice, Notes, Shot, ffmpeg};
+use super::shot::Shot;
 use crate::picture::{HEIGHT, Impression, WIDTH};
 use crate::source::Source;
 use crate::{Error, Hooks};
@@ -45,7 +48,7 @@ fn read_with(
 ) -> Result<Vec<Shot>, Error> {
     let shown = source.path.display();
     cif_input::check(&source.path).map_err(Error::io("read", &source.path))?;
-    hooks.tell(&format!("looking at {}", source.camera));
+    hooks.say(&format!("looking at {}", source.camera));
     let Look { mut seen, size, colors } = look(program, source, hooks)?;
     let conversion = conversion(source, &colors, notes)?;
     let start = seen[0].time;
@@ -73,7 +76,7 @@ fn read_with(
             "check the video, and the range of seconds",
         ));
     }
-    hooks.tell(&format!("{} of {} frames of {}", taken.len(), seen.len(), source.camera));
+    hooks.say(&format!("{} of {} frames of {}", taken.len(), seen.len(), source.camera));
     let into = folder.join(&source.camera);
     std::fs::create_dir_all(&into).map_err(Error::io("create", &into))?;
     let written = write(program, source, &taken, choice.max_side, conversion.as_ref(), &into, hooks)?;
@@ -221,8 +224,7 @@ fn time_of(facts: &str) -> Option<f64> {
 /// three.
 fn spread_of_distances(seen: &[Seen]) -> Option<f64> {
     let mut distances: Vec<f64> = seen.windows(2).map(|pair| pair[1].time - pair[0].time).collect();
-    distances.sort_by(f64::total_cmp);
-    let median = *distances.get(distances.len() / 2).filter(|_| distances.len() > 1)?;
+    let median = upper_median(&mut distances).filter(|_| distances.len() > 1)?;
     let (low, high) = (distances.first()?, distances.last()?);
     (median > 0.0).then(|| (high - median).max(median - low) / median)
 }
@@ -391,9 +393,9 @@ mod tests {
             let number = number_in(&shot.file);
             assert_eq!(shot.name, format!("{number:06}.png"));
             assert!((2 * k..2 * k + 2).contains(&number), "{number} of window {k}");
-            let told = shot.source.as_ref().unwrap();
-            assert_eq!((told.file.as_str(), told.size), ("walk.mkv", [48, 32]));
-            let place = told.video.unwrap();
+            let source = shot.source.as_ref().unwrap();
+            assert_eq!((source.file.as_str(), source.size), ("walk.mkv", [48, 32]));
+            let place = source.video.unwrap();
             assert_eq!((place.frame, place.of), (number as u64, 300));
             assert!((place.time - number as f64 / 15.0).abs() < 2e-3, "{place:?}");
         }
@@ -429,9 +431,10 @@ mod tests {
         }
         let tags = ["-color_primaries", "smpte432", "-color_trc", "arib-std-b67"];
         let Some(path) = video_with(folder.path(), &signals(0.38, 0.75), &tags, "p3.mkv") else { return };
-        let told = read(&source(&path), "", &choice, folder.path(), &hooks, &mut Notes::new()).unwrap_err();
-        let told = told.to_string();
-        assert!(told.contains("HLG") && told.contains("smpte432"), "{told}");
+        let message =
+            read(&source(&path), "", &choice, folder.path(), &hooks, &mut Notes::new()).unwrap_err();
+        let message = message.to_string();
+        assert!(message.contains("HLG") && message.contains("smpte432"), "{message}");
     }
 
     #[cfg(unix)]
@@ -457,16 +460,16 @@ mod tests {
                 &mut Notes::new(),
             )
         };
-        let told = stand_in(
+        let message = stand_in(
             "echo '[Parsed_x @ 0x1] [error] No space for terms' >&2; echo '[info] Conversion failed!' >&2; exit 1",
         );
-        let told = told.unwrap_err().to_string();
-        assert!(told.ends_with("ffmpeg fails: No space for terms"), "{told}");
+        let message = message.unwrap_err().to_string();
+        assert!(message.ends_with("ffmpeg fails: No space for terms"), "{message}");
         // One that does not know -fps_mode, and gives no frames.
-        let told = stand_in(
+        let message = stand_in(
             "case \"$*\" in *-fps_mode*) echo \"[error] Unrecognized option 'fps_mode'.\" >&2; exit 1;; esac",
         );
-        assert!(told.unwrap_err().to_string().contains("no frames that ffmpeg can decode"));
+        assert!(message.unwrap_err().to_string().contains("no frames that ffmpeg can decode"));
     }
 
     #[test]
@@ -515,15 +518,17 @@ mod tests {
         let path = folder.path().join("notes.mp4");
         std::fs::write(&path, b"no video at all").unwrap();
         let (choice, hooks) = (Choice::default(), Hooks::silent());
-        let told = |ffmpeg: &str| {
+        let message = |ffmpeg: &str| {
             let mut notes = Notes::new();
             read_with(OsStr::new(ffmpeg), &source(&path), "", &choice, folder.path(), &hooks, &mut notes)
                 .unwrap_err()
         };
-        let Error::Refused { problem, fix } = told("no-such-ffmpeg") else { panic!("another error") };
+        let Error::System(cif_system::Error::Refused { problem, fix }) = message("no-such-ffmpeg") else {
+            panic!("another error")
+        };
         assert!(problem.contains("not installed") && fix.contains("apt install ffmpeg"), "{problem} {fix}");
         if Command::new("ffmpeg").arg("-version").output().is_ok() {
-            let error = told("ffmpeg").to_string();
+            let error = message("ffmpeg").to_string();
             assert!(error.contains("notes.mp4") && error.contains("no pictures"), "{error}");
             // Sound alone.
             if let Some(path) = video_of_sound(folder.path()) {

@@ -3,7 +3,7 @@
 //! manual), and with the scale of the chunk.
 //!
 //! Axes and unit are those of the chunk's reference, the origin is that of its transform: georeferenced worlds
-//! begin in the middle of the earth. Whether the unit is a metre and +z is up, the file does not tell for
+//! begin in the middle of the earth. The file does not say that the unit is a metre and +z is up for
 //! certain.
 //!
 //! Of a rig, the master camera has a pose at each moment, and the sensors of the others have a rotation and a location in
@@ -16,7 +16,7 @@ use cif_geometry::{LensDistortion, RigidTransform};
 use glam::{DMat3, DVec3};
 use roxmltree::{Document, Node};
 
-use super::{Imported, add};
+use super::imported::{Imported, add};
 use crate::Error;
 use crate::poses::{Lens, Poses};
 use crate::similarity::Similarity;
@@ -400,15 +400,15 @@ mod tests {
         assert!(near(slave.translation, master.apply(DVec3::new(0.5, 0.0, 0.0))), "{slave:?}");
         assert!(near(slave.rotation * DVec3::Z, master.rotation * DVec3::X), "it looks to the right");
         assert!(found.notes[0].contains("2 cameras were not aligned"), "{:?}", found.notes);
-        let told = read_text(&text.replace("<location>0.5 0 0</location>", "<location fixed=\"true\"/>"));
-        let told = told.unwrap_err().to_string();
-        assert!(told.contains("right.jpg") && told.contains("location"), "{told}");
+        let message = read_text(&text.replace("<location>0.5 0 0</location>", "<location fixed=\"true\"/>"));
+        let message = message.unwrap_err().to_string();
+        assert!(message.contains("right.jpg") && message.contains("location"), "{message}");
     }
 
     #[test]
     fn what_cannot_be_read_is_told() {
         let good = document(SENSOR, "", &camera("a.jpg", "", POSE));
-        for (from, to, told) in [
+        for (from, to, message) in [
             ("<chunk", "<chank", "chunk"),
             ("0 0 1 1 ", "0 0 1 x ", "a.jpg: <transform>"),
             ("0 0 1 1 ", "0 0 2 1 ", "rigid"),
@@ -423,10 +423,11 @@ mod tests {
                 .replace(from, to)
                 .replace("</chunk>", if to == "<chank" { "</chank>" } else { "</chunk>" });
             assert_ne!(text, good, "{from}");
-            let Error::Refused { problem, fix } = read_text(&text).unwrap_err() else {
+            let Error::System(cif_system::Error::Refused { problem, fix }) = read_text(&text).unwrap_err()
+            else {
                 panic!("another error")
             };
-            assert!(problem.contains(told) && problem.contains("cameras.xml"), "{told}: {problem}");
+            assert!(problem.contains(message) && problem.contains("cameras.xml"), "{message}: {problem}");
             assert!(fix.contains("Agisoft XML"), "{fix}");
         }
         let unaligned = document(SENSOR, "", r#"<camera id="2" sensor_id="0" label="lost.jpg"/>"#);

@@ -8,7 +8,7 @@ use cif_geometry::{LensDistortion, RigidTransform};
 use glam::{DMat3, DVec3};
 use serde::Deserialize;
 
-use super::{Imported, add};
+use super::imported::{Imported, add};
 use crate::Error;
 use crate::poses::{Lens, Poses};
 

@@ -7,7 +7,7 @@ use std::path::Path;
 use cif_geometry::{LensDistortion, RigidTransform};
 use glam::{DMat3, DVec3};
 
-use super::{Imported, add};
+use super::imported::{Imported, add};
 use crate::Error;
 use crate::frames::Shot;
 use crate::poses::{Lens, Poses};

@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::Path;
 
+use cif_dataset::orientation::Orientation;
 use glam::DVec3;
 
 use super::*;
@@ -76,7 +77,9 @@ fn a_transforms_file_brings_times_too() {
 #[test]
 fn what_is_of_no_tool_is_refused_with_those_that_are_known() {
     let root = tempfile::tempdir().unwrap();
-    let Err(Error::Refused { problem, fix }) = read(root.path(), &[]) else { panic!("poses of nothing") };
+    let Err(Error::System(cif_system::Error::Refused { problem, fix })) = read(root.path(), &[]) else {
+        panic!("poses of nothing")
+    };
     assert!(
         problem.contains("no poses") && fix.contains("COLMAP") && fix.contains("Polycam"),
         "{problem} {fix}"
@@ -117,8 +120,8 @@ fn poses_of_stored_pixels_turn_with_their_photographs() {
         assert!((0..2).all(|k| (found[k] - pixel[k]).abs() < 1e-9), "{turned:?}: {found:?}");
         assert_eq!(notes.len(), usize::from(turned != Orientation::NoTransforms), "{notes:?}");
     }
-    let told = seen(root.path(), (48, 64), Orientation::Rotate90FlipH).unwrap_err().to_string();
-    assert!(told.contains("one.png") && told.contains("mirrors"), "{told}");
+    let message = seen(root.path(), (48, 64), Orientation::Rotate90FlipH).unwrap_err().to_string();
+    assert!(message.contains("one.png") && message.contains("mirrors"), "{message}");
     // Of photographs that were turned upright before.
     camera("1 PINHOLE 96 128 80 80 50 60\n");
     let (_, found, notes) = seen(root.path(), (48, 64), Orientation::Rotate90).unwrap();
@@ -128,7 +131,10 @@ fn poses_of_stored_pixels_turn_with_their_photographs() {
     );
     for turned in [Orientation::NoTransforms, Orientation::Rotate90] {
         camera("1 PINHOLE 60 60 80 80 30 30\n");
-        let told = seen(root.path(), (48, 64), turned).unwrap_err().to_string();
-        assert!(told.contains("60 x 60") && told.contains("48 x 64") && told.contains("aspect"), "{told}");
+        let message = seen(root.path(), (48, 64), turned).unwrap_err().to_string();
+        assert!(
+            message.contains("60 x 60") && message.contains("48 x 64") && message.contains("aspect"),
+            "{message}"
+        );
     }
 }

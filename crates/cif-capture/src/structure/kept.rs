@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 const BEGINNINGS: [&str; 2] = ["features-", "matches-"];
 const ENDINGS: [&str; 5] = [".db", ".db-journal", ".db-wal", ".db-shm", ".part"];
 
-/// The folder for features and matches of a capture that is written to `place`: beside it, under its name.
+/// The folder for features and matches of a capture that is written to `place`: next to it, under its name.
 #[must_use]
 pub fn kept_beside(place: &Path) -> PathBuf {
     let mut name = place.as_os_str().to_owned();

@@ -7,14 +7,15 @@
 //! plain objects need.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+
+use cif_geometry::stats::upper_median;
 
 use super::features::{SETTINGS, chosen, median};
-use super::pairs::{Order, pairs};
+use super::pairs::pairs;
 use super::python::{Group, Job, Mapper, Model, Outcome, Run, run};
+use super::request::{Lenses, Request};
 use super::stage::Staged;
 use super::verdict::{Second, Verdict, judge};
-use crate::frames::Shot;
 use crate::poses::Poses;
 use crate::{Error, Hooks};
 
@@ -29,39 +30,6 @@ const FEW_FEATURES: usize = 40;
 /// the larger side from the same place: about the noise of features, which are found on some 600 pixels. Two
 /// recordings of fixed cameras had 0.0001 and 0.0011, eleven of moving ones 0.033 to 0.12.
 const STILL: f64 = 1.0 / 600.0;
-
-/// Which images share a lens.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Lenses {
-    /// All of one size: cameras of one make, at one zoom.
-    #[default]
-    PerSize,
-    /// Those of one camera.
-    PerCamera,
-}
-
-/// Images whose poses are wanted.
-#[derive(Clone, Copy)]
-pub struct Request<'a> {
-    /// Images, ordered by camera and then by time.
-    pub shots: &'a [Shot],
-    /// Folder of `NAME.png` for the name of every image, in which black is left out.
-    pub masks: Option<&'a Path>,
-    /// How images follow each other.
-    pub order: Order,
-    /// Which of them share a lens.
-    pub lenses: Lenses,
-    /// Focal length to start from, pixels; that of EXIF else, where there is one.
-    pub focal_px: Option<f64>,
-    /// True where every camera moves, though its images may show otherwise.
-    pub moving: bool,
-    /// Folder for files of this request.
-    pub work: &'a Path,
-    /// Folder of features and matches, which later requests of the same images take up.
-    pub kept: &'a Path,
-    /// Threads for features and matches; poses do not depend on it.
-    pub threads: usize,
-}
 
 /// Poses, and what is to be thought of them.
 #[derive(Clone, Debug)]
@@ -127,7 +95,7 @@ pub fn find(request: &Request<'_>, hooks: &Hooks<'_>) -> Result<Found, Error> {
             break;
         }
         if number + 1 < SETTINGS {
-            hooks.tell("not believed, going on with more features");
+            hooks.say("not believed, going on with more features");
         }
     }
     let Some(best) = best else {
@@ -162,10 +130,7 @@ fn standing<'a>(cameras: &[&'a str], pairs: &[(usize, usize)], moved: &[Option<f
             apart.entry(cameras[*a]).or_default().push(moved);
         }
     }
-    let stands = |apart: &mut Vec<f64>| {
-        apart.sort_by(f64::total_cmp);
-        apart[apart.len() / 2] < STILL
-    };
+    let stands = |apart: &mut Vec<f64>| upper_median(apart).is_some_and(|apart| apart < STILL);
     apart.into_iter().find_map(|(camera, mut apart)| stands(&mut apart).then_some(camera))
 }
 

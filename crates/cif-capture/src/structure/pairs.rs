@@ -14,7 +14,7 @@ pub enum Order {
     Any,
 }
 
-/// Pairs `(a, b)` with a < b, ascending. `cameras` tells which camera took each image; images are ordered by
+/// Pairs `(a, b)` with a < b, ascending. `cameras` holds the camera of each image; images are ordered by
 /// camera, then by time.
 ///
 /// In sequences every image is matched with those 1, 2, 4, 8, 16, ... further on, and with those at the same share of the

@@ -1,5 +1,5 @@
 //! Points that images with known poses see. One moment of a rig gives few: most are seen by two cameras alone,
-//! which mappers leave out because they have no poses yet to check them by. With poses, two views tell a place as
+//! which mappers leave out because they have no poses yet to check them by. With poses, two views fix a place as
 //! well as more, and other moments show what people or things hid. Poses of other tools, and captures that are trained
 //! on as they are, may come without any.
 
@@ -12,13 +12,13 @@ use cif_geometry::PinholeCamera;
 use rayon::prelude::*;
 
 use super::features::Features;
-use super::ladder::{Lenses, Request};
 use super::pairs::{Order, pairs};
 use super::python::{Group, Job, KnownPose, run};
+use super::request::{Lenses, Request};
 use super::stage::Staged;
 use crate::frames::Shot;
 use crate::picture::Photograph;
-use crate::poses::{Lens, Point, Pose, Poses};
+use crate::poses::{Lens, Point, Pose, Poses, spread};
 use crate::{Error, Hooks, Impression};
 
 /// Moments of the rig that are looked at; each adds about as many points, and takes as long, as the first.
@@ -31,7 +31,7 @@ const IMAGES_OF_RIG: usize = 60;
 const IMAGES_OF_WALK: usize = 150;
 
 /// Each such image is matched with these of the others, from the one with the most similar view on: near ones show the
-/// same from nearly the same place, far ones tell how far it is.
+/// same from nearly the same place, far ones fix its distance.
 const NEIGHBOURS: [usize; 7] = [1, 2, 3, 5, 8, 13, 21];
 
 /// Images that have to see a point where they are of different times: by two alone, what has moved can look as if it lay
@@ -144,7 +144,7 @@ fn known(dataset: &Dataset, frames: &[usize], work: &Path) -> Result<(Vec<Shot>,
 /// angles, and as they are away from each other, as a share of how far all of them spread.
 fn neighbours(cameras: &[PinholeCamera]) -> Vec<(usize, usize)> {
     let centres: Vec<_> = cameras.iter().map(PinholeCamera::centre).collect();
-    let spread = crate::similarity::spread(&centres).max(f64::MIN_POSITIVE);
+    let spread = spread(&centres).max(f64::MIN_POSITIVE);
     let mut pairs = BTreeSet::new();
     for (a, camera) in cameras.iter().enumerate() {
         let apart = |b: usize| {
@@ -159,7 +159,7 @@ fn neighbours(cameras: &[PinholeCamera]) -> Vec<(usize, usize)> {
     pairs.into_iter().collect()
 }
 
-/// Points of images that follow each other as `request.order` tells, by poses that are known and stay as they are.
+/// Points of images that follow each other as `request.order` says, by poses that are known and stay as they are.
 /// Lenses are those of the poses.
 ///
 /// # Errors

@@ -7,11 +7,12 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use cif_geometry::{LensDistortion, RigidTransform};
+use cif_system::environment;
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 use super::features::Features;
-use super::ladder::Request;
+use super::request::Request;
 use super::stage::Staged;
 use crate::poses::{Lens, Point, Pose, Poses};
 use crate::{Error, Hooks, child};
@@ -20,7 +21,7 @@ use crate::{Error, Hooks, child};
 const SCRIPT: &str = include_str!("reconstruct.py");
 
 /// Environment variable that names the Python.
-const VARIABLE: &str = "CIF_PYTHON";
+const VARIABLE: &str = environment::PYTHON.name();
 
 /// Points that are seen from fewer images, or lie further from where they are seen, are left out.
 const MIN_TRACK: usize = 3;
@@ -44,7 +45,7 @@ pub fn set_python(program: PathBuf) {
 /// Pythons to try for packages of Python, in order.
 #[must_use]
 pub fn pythons() -> Vec<OsString> {
-    if let Some(program) = std::env::var_os(VARIABLE).filter(|program| !program.is_empty()) {
+    if let Some(program) = environment::PYTHON.value().filter(|program| !program.is_empty()) {
         return vec![program];
     }
     match OWN.get() {
@@ -151,7 +152,7 @@ pub(super) enum Mapper {
     Incremental,
 }
 
-/// What a mapper found.
+/// Result of a mapper.
 #[derive(Clone, Debug)]
 pub(super) struct Model {
     /// Of the images that have some.
@@ -247,7 +248,7 @@ pub(super) fn run(job: &Job<'_>, hooks: &Hooks<'_>) -> Result<Outcome, Error> {
         let mut steps = 0;
         let line = |line: &str| {
             if let Some((done, total, words)) = counted(line) {
-                if total > 0 { hooks.count(words, done, total) } else { hooks.tell(words) }
+                if total > 0 { hooks.count(words, done, total) } else { hooks.say(words) }
             } else if STEP_OF_GLOBAL_MAPPER.iter().all(|part| line.contains(part)) {
                 steps += 1;
                 hooks.count(
@@ -306,7 +307,7 @@ fn words_of(text: &str) -> String {
 fn outcome(answer: AnswerJson) -> Result<Outcome, Error> {
     let model = |model: ModelJson| Ok(Model { fitting: model.fitting, poses: poses(model)? });
     let runs = answer.runs.into_iter().map(|found| found.map(model).transpose());
-    // Where poses are known, two views tell a place too, if they agree well.
+    // Where poses are known, two views fix a place too, if they agree well.
     let is_sure = |point: &&PointJson| {
         (point.images >= MIN_TRACK && point.error <= MAX_ERROR_PX) || point.error <= MAX_ERROR_OF_TWO_PX
     };
@@ -389,7 +390,9 @@ mod tests {
     #[test]
     fn a_missing_pycolmap_is_told_with_the_way_to_install_it() {
         let error = pycolmap_missing("No module named 'pycolmap'", "/usr/bin/python3", "3.12.1");
-        let Error::Refused { problem, fix } = error else { panic!("another error") };
+        let Error::System(cif_system::Error::Refused { problem, fix }) = error else {
+            panic!("another error")
+        };
         assert!(problem.contains("/usr/bin/python3") && problem.contains("3.12.1"), "{problem}");
         assert!(fix.contains("pip install 'cif4d[capture]'") && fix.contains("--poses"), "{fix}");
     }

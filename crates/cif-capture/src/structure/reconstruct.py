@@ -56,7 +56,7 @@ MODELS = 3
 TRACKS = 300
 
 
-def tell(done, total, words):
+def progress(done, total, words):
     """Show the progress."""
     print("@", done, total, words, file=sys.stderr, flush=True)
 
@@ -68,9 +68,9 @@ def in_parts(job, things, size, done, words):
         # The job before this one has shown it.
         return
     for start in range(0, len(things), size):
-        tell(done + start, total, words)
+        progress(done + start, total, words)
         yield things[start : start + size]
-    tell(total, total, words)
+    progress(total, total, words)
 
 
 def extract(pycolmap, job):
@@ -233,7 +233,7 @@ def reconstruct(pycolmap, job, database, mapper, seed):
 
         def show(count):
             registered[0] = count
-            tell(min(count, images), images, "poses of images, incremental mapper")
+            progress(min(count, images), images, "poses of images, incremental mapper")
 
         show(0)
         callbacks = {
@@ -252,7 +252,7 @@ def reconstruct(pycolmap, job, database, mapper, seed):
 
 def triangulated(pycolmap, job, database):
     """Return the model of images whose poses are known, with the points that two or more of them see."""
-    tell(0, 0, "points")
+    progress(0, 0, "points")
     import numpy
 
     model = pycolmap.Reconstruction()

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 use xxhash_rust::xxh3::{Xxh3, xxh3_128};
 
-use super::ladder::Request;
+use super::request::Request;
 use crate::Error;
 
 /// Images that were put into place.

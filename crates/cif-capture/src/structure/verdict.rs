@@ -250,7 +250,7 @@ mod tests {
     #[test]
     fn few_images_wrong_lenses_and_large_errors_are_told() {
         let a = arc(20);
-        for (change, told) in [
+        for (change, expected) in [
             (
                 Box::new(|poses: &mut Poses| poses.lenses[0].focal_px = [2500.0; 2])
                     as Box<dyn Fn(&mut Poses)>,
@@ -269,7 +269,10 @@ mod tests {
             let mut changed = a.clone();
             change(&mut changed);
             let verdict = judge(&changed, Some(&a), 20);
-            assert!(failing(&verdict).len() == 1 && failing(&verdict)[0].contains(told), "{told}: {verdict}");
+            assert!(
+                failing(&verdict).len() == 1 && failing(&verdict)[0].contains(expected),
+                "{expected}: {verdict}"
+            );
         }
         let verdict = judge(&a, Some(&a), 30);
         assert!(failing(&verdict)[0].contains("20 of 30 images"), "{verdict}");

@@ -2,7 +2,7 @@
 //!
 //! | module | answers |
 //! |---|---|
-//! | `source` | what lies in the file and beside it, and whether it may be read |
+//! | `source` | what lies in the file and next to it, and whether it may be read |
 //! | `accessor` | the numbers of an accessor |
 //! | `hierarchy` | nodes and their transforms |
 //! | `animation` | curves over time |

@@ -111,7 +111,7 @@ impl Source {
         });
         if scheme {
             return Err(format!(
-                "it lies at {uri}; put that file beside this one and name it by its file name"
+                "it lies at {uri}; put that file next to this one and name it by its file name"
             ));
         }
         let name = percent_encoding::percent_decode_str(uri)
@@ -120,12 +120,12 @@ impl Source {
         let relative = Path::new(name.as_ref());
         let inside =
             relative.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
-        let outside = || format!("{uri} leaves the folder of the file; put the buffer beside the file");
+        let outside = || format!("{uri} leaves the folder of the file; put the buffer next to the file");
         if !inside || name.contains('\\') || name.is_empty() {
             return Err(outside());
         }
         let missing =
-            |error: std::io::Error| format!("{uri} cannot be read ({error}); put it beside the file");
+            |error: std::io::Error| format!("{uri} cannot be read ({error}); put it next to the file");
         let folder = folder_of(&self.path).canonicalize().map_err(missing)?;
         // Links may lead out as well.
         let path = folder.join(relative).canonicalize().map_err(missing)?;

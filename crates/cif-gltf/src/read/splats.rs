@@ -155,7 +155,7 @@ impl Reader<'_> {
         Ok(())
     }
 
-    /// The instances that every splat may belong to; empty where the file does not tell.
+    /// The instances that every splat may belong to; empty where the file has none.
     fn identities(&self, n: usize) -> Result<Vec<IdentityShares>, GltfError> {
         let accessors = (self.accessor(crate::INSTANCE_IDS), self.accessor(crate::INSTANCE_SHARES));
         let (Some(ids), Some(shares)) = accessors else { return Ok(Vec::new()) };

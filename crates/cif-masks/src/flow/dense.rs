@@ -1,7 +1,8 @@
 //! Displacements of patches blended into a dense field. Source: Kroeger et al. 2016, equation 3.
 
+use super::field::Flow;
 use super::patches::{Patches, SIDE};
-use super::{Flow, Level};
+use super::pyramid::Level;
 use crate::plane::Plane;
 
 /// The mean of the displacements of all patches over a pixel, weighted by 1 / max(1, |difference of brightness|) of the

@@ -1,6 +1,7 @@
 //! Patches on a grid, aligned by inverse compositional Gauss-Newton. Source: Kroeger et al. 2016, section 2.1.
 
-use super::{Flow, Level};
+use super::field::Flow;
+use super::pyramid::Level;
 use crate::plane::Plane;
 
 /// Side of a patch, pixels.

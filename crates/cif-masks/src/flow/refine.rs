@@ -4,7 +4,8 @@
 //! ECCV 2004, equations 4 to 11, with the normalisation of data terms and the weights that DIS (Kroeger et al. 2016)
 //! uses: constancy of brightness and of its gradient, robust smoothness, one warp per level.
 
-use super::{Flow, Level};
+use super::field::Flow;
+use super::pyramid::{Level, derivatives};
 use crate::plane::{Plane, Tap};
 
 /// Weight of smoothness.
@@ -130,8 +131,8 @@ fn terms(first: &Level, second: &Level, field: &Flow) -> [Term; 3] {
     };
     let dx = middle(&warped[1], &first.dx.data);
     let dy = middle(&warped[2], &first.dy.data);
-    let (dxx, dxy) = super::derivatives(&dx);
-    let (dyx, dyy) = super::derivatives(&dy);
+    let (dxx, dxy) = derivatives(&dx);
+    let (dyx, dyy) = derivatives(&dy);
     [
         Term::new(difference(&warped[0], &first.brightness.data), dx.data, dy.data),
         Term::new(difference(&warped[1], &first.dx.data), dxx.data, dxy.data),

@@ -79,8 +79,8 @@ mod tests {
 
     #[test]
     fn a_pixel_in_doubt_follows_what_has_its_colour() {
-        // A row of two colours: what is in doubt beside the border belongs to its own side; what is sure among its like
-        // becomes surer.
+        // A row of two colours: what is in doubt next to the border belongs to its own side; what is sure among its
+        // like becomes surer.
         let lab =
             [0; 3].map(|_| Plane { width: 6, height: 1, data: vec![10.0, 10.0, 10.0, 80.0, 80.0, 80.0] });
         let shares = [[0.9, 0.1], [0.9, 0.1], [0.45, 0.55], [0.55, 0.45], [0.1, 0.9], [0.1, 0.9]].concat();

@@ -11,12 +11,12 @@ pub(crate) struct Belief {
     pub(crate) shares: Vec<f32>,
     /// `[pixels]`, 0 to 1: product over the steps since the keyframe of how well forward and backward flow agree.
     pub(crate) reliability: Vec<f32>,
-    /// `[classes]`: the way can tell where the class is, as the keyframe that it comes from shows it.
+    /// `[classes]`: true where the keyframe that it comes from shows the class.
     pub(crate) shown: Vec<bool>,
 }
 
 impl Belief {
-    /// Belief in one class per pixel, as much as told; the rest is shared by all classes.
+    /// Belief in one class per pixel, as far as known; the rest is shared by all classes.
     pub(crate) fn in_classes(classes: usize, of_pixel: &[u16], reliability: Vec<f32>) -> Self {
         let mut shares = Vec::with_capacity(of_pixel.len() * classes);
         let mut shown = vec![false; classes];

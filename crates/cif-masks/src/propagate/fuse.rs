@@ -3,19 +3,19 @@
 use cif_geometry::PixelGrid;
 use rayon::prelude::*;
 
-use super::Mask;
 use super::agree::agreed;
 use super::belief::Belief;
+use super::clip::Mask;
 use crate::plane::{Plane, Tap};
 
-/// Keeps a way that is unreliable or far in time in play.
+/// Keeps a belief that is unreliable or far in time in play.
 const FLOOR: f32 = 0.02;
 
 /// Blends beliefs about a frame, each weighed by its share and by its reliability at the pixel, lets pixels follow their
 /// neighbours of the same colour (`lab`), and takes the most probable class of every pixel of the image. Its confidence
 /// is its probability before neighbours were asked.
 pub(super) fn mask(
-    ways: &[(f32, &Belief)],
+    directions: &[(f32, &Belief)],
     lab: &[Plane; 3],
     ids: &[u16],
     (width, height): (usize, usize),
@@ -25,10 +25,10 @@ pub(super) fn mask(
     let mut shares = vec![0.0_f32; width * height * classes];
     shares.par_chunks_mut(classes).enumerate().for_each(|(pixel, shares)| {
         let mut sum = 0.0;
-        for (k, (share, belief)) in ways.iter().enumerate() {
+        for (k, (share, belief)) in directions.iter().enumerate() {
             let weight = (share + FLOOR) * (belief.reliability[pixel] + FLOOR);
             sum += weight;
-            let other = ways.get(1 - k).map_or(*belief, |(_, other)| *other);
+            let other = directions.get(1 - k).map_or(*belief, |(_, other)| *other);
             add_told(shares, weight, belief, other, pixel);
         }
         shares.iter_mut().for_each(|share| *share /= sum);
@@ -68,8 +68,8 @@ pub(super) fn mask(
     }
 }
 
-/// Adds a belief about a pixel to weighted sums of shares. A way from a keyframe that does not show an object cannot tell
-/// where that object is: as far as the way is not reliable, it takes the word of the `other` one on it.
+/// Adds a belief about a pixel to weighted sums of shares. The belief from a keyframe that does not show an object does
+/// not know where that object is: as far as it is not reliable, the `other` one decides.
 fn add_told(sums: &mut [f32], weight: f32, belief: &Belief, other: &Belief, pixel: usize) {
     let row = pixel * belief.classes..(pixel + 1) * belief.classes;
     let (own, other) = (&belief.shares[row.clone()], &other.shares[row]);
@@ -99,7 +99,7 @@ mod tests {
 
     #[test]
     fn a_keyframe_without_an_object_does_not_deny_it_where_its_way_is_unreliable() {
-        // The first way has never seen class 2, of which the second is fairly sure.
+        // The first belief has never seen class 2, of which the second is fairly sure.
         let belief = |shares: [f32; 3], reliability: f32, sees: bool| Belief {
             classes: 3,
             shares: shares.to_vec(),
@@ -118,7 +118,7 @@ mod tests {
             assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{found:?}");
         };
         close(fused(0.0), [0.9 * 0.32 + 0.1 * 0.4, 0.9 * 0.08, 0.6]);
-        // Where its way is reliable, it is not there.
+        // Where its belief is reliable, it is not there.
         close(fused(1.0), [0.9 * 0.8 + 0.1 * 0.4, 0.9 * 0.2, 0.1 * 0.6]);
     }
 }

@@ -1,11 +1,13 @@
 //! Masks of all frames of a camera from some of them.
 //!
 //! Between two keyframes, ids are brought from both along the optical flow, step by step; each step is weighed with what
-//! the pixels look like ([`step`]), and the two are blended by distance in time and by how reliable each way was
-//! ([`fuse`]). Before the first and after the last keyframe there is one way only.
+//! the pixels look like ([`step`]), and the two are blended by distance in time and by how reliable each was
+//! ([`fuse`]). Before the first and after the last keyframe there is one direction only.
 //!
 //! | module | answers |
 //! |---|---|
+//! | [`clip`] | frames of a camera, those whose ids are known, and the masks that come of them |
+//! | [`motion`] | motion from a frame to its neighbour, and how far it is trusted |
 //! | [`window`] | flows and looks of some frames in a row |
 //! | [`scenery`] | pixels that cannot be of what stands around them |
 //! | [`belief`] | probabilities of classes per pixel |
@@ -15,7 +17,9 @@
 
 mod agree;
 pub(crate) mod belief;
+mod clip;
 mod fuse;
+mod motion;
 mod scenery;
 mod step;
 mod window;
@@ -26,6 +30,7 @@ use std::ops::RangeInclusive;
 use cif_geometry::PixelGrid;
 use cif_system::memory::Need;
 
+pub use self::clip::{Clip, Keyframe, Mask};
 use crate::Error;
 use crate::appearance::{Features, Forest, Samples};
 use crate::picture::Picture;
@@ -49,49 +54,11 @@ const READ_BYTES_PER_PIXEL: usize = 43;
 /// Most frames of a window.
 const WINDOW_FRAMES: usize = 32;
 
-/// Keyframes whose pixels tell what classes look like: those nearest in time.
+/// Keyframes whose pixels train the appearance of classes: those nearest in time.
 const NEAREST_KEYFRAMES: usize = 4;
 
 /// Confidence from which a pixel of a keyframe stands for its class.
 pub(crate) const SURE: f32 = 0.5;
-
-/// A frame whose ids are known.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Keyframe {
-    /// Ids, 0 = unlabelled; of the aspect of the images.
-    pub ids: PixelGrid<u16>,
-    /// Confidence of every pixel, 0 to 1, at the size of `ids`; `None` for painted ones, which are certain.
-    pub confidence: Option<PixelGrid<f32>>,
-}
-
-impl Keyframe {
-    /// A frame that was painted.
-    #[must_use]
-    pub fn painted(ids: PixelGrid<u16>) -> Self {
-        Self { ids, confidence: None }
-    }
-}
-
-/// Frames of one camera, in order of time.
-pub struct Clip<'a> {
-    /// Number of frames.
-    pub frames: usize,
-    /// Loads the image of a frame; all have one size.
-    pub image: &'a (dyn Fn(usize) -> Result<PixelGrid<[u8; 3]>, Error> + Sync),
-    /// Frames whose ids are known.
-    pub keyframes: &'a BTreeMap<usize, Keyframe>,
-    /// True to stop with [`Error::Stopped`]; asked several times a second.
-    pub stop: &'a (dyn Fn() -> bool + Sync),
-}
-
-/// The mask of a frame.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Mask {
-    /// Ids, 0 = unlabelled, at the size of the image.
-    pub ids: PixelGrid<u16>,
-    /// Probability that the id is right, in units of 1 / 255; 255 everywhere in painted keyframes.
-    pub confidence: PixelGrid<u8>,
-}
 
 /// Propagates the keyframes of a clip to all frames. `done` takes each mask with its frame, in no particular order.
 ///
@@ -126,7 +93,7 @@ pub fn propagate(
 /// Memory that beliefs take: of a frame about all classes, and of the frames between two keyframes about the few that are
 /// kept.
 fn memory_of_beliefs(keys: &[usize], classes: usize, (width, height): (usize, usize)) -> Need {
-    /// Beliefs at a time, of a float per class: both ways, their blend, and that after neighbours were asked.
+    /// Beliefs at a time, of a float per class: both directions, their blend, and that after neighbours were asked.
     const BELIEFS: u64 = 4;
     let gap = keys.windows(2).map(|pair| pair[1] - pair[0]).max().unwrap_or(0) as u64;
     let [pixels, classes] = [width * height, classes].map(|number| number as u64);
@@ -272,11 +239,11 @@ impl<'a> Run<'a> {
     fn step(&self, window: &Window, from: usize, to: usize, known: &Belief) -> Result<Belief, Error> {
         self.go_on()?;
         let (width, height) = self.size;
-        Ok(Step { width, height, way: window.way(from, to), seen: window.seen(to) }.take(known))
+        Ok(Step { width, height, motion: window.motion(from, to), seen: window.seen(to) }.take(known))
     }
 
-    fn mask(&self, ways: &[(f32, &Belief)], seen: &Seen) -> Mask {
-        fuse::mask(ways, &seen.lab, &self.classes.ids, self.size, self.full)
+    fn mask(&self, directions: &[(f32, &Belief)], seen: &Seen) -> Mask {
+        fuse::mask(directions, &seen.lab, &self.classes.ids, self.size, self.full)
     }
 
     /// From a keyframe through frames that have no keyframe beyond them.
@@ -292,7 +259,7 @@ impl<'a> Run<'a> {
         }
         let forest = self.forest(key..=key);
         let mut belief = self.start(key);
-        // No other way tells of what the keyframe does not show.
+        // Nothing else shows what the keyframe does not.
         belief.shown.fill(true);
         let mut at = key;
         for some in frames.chunks(self.window_frames() - 1) {
@@ -342,8 +309,8 @@ impl<'a> Run<'a> {
                 belief = self.step(&these, at + 1, at, &belief)?;
                 let forward = forwards[&at].restored();
                 let share = (last - at) as f32 / (last - first) as f32;
-                let ways = [(share, &forward), (1.0 - share, &belief)];
-                done(at, self.mask(&ways, these.seen(at)))?;
+                let directions = [(share, &forward), (1.0 - share, &belief)];
+                done(at, self.mask(&directions, these.seen(at)))?;
             }
         }
         Ok(())

@@ -1,12 +1,12 @@
 //! Pixels that cannot be of what stands around them.
 //!
-//! What is unlabelled mostly stands still, and moves in the image as what is around it. A pixel that has another colour
-//! than what was, and than what will be, where the motion around it leads, is of something that passes in front. It
-//! speaks for objects whose own motion cannot be followed: that roll, or come back from behind others.
+//! Unlabelled pixels mostly stand still, and move in the image as their surroundings do. A pixel that has another
+//! colour than what was, and than what will be, where the motion around it leads, is of something that passes in front.
+//! It speaks for objects whose own motion cannot be followed: that roll, or come back from behind others.
 
 use rayon::prelude::*;
 
-use super::window::Way;
+use super::motion::Motion;
 use crate::flow::Flow;
 use crate::plane::{Plane, Tap};
 
@@ -32,9 +32,11 @@ const FLOOR: f32 = 0.1;
 
 /// Factors of the evidence that pixels of some frames in a row are unlabelled, by the motion between neighbours and the
 /// colours of each.
-pub(super) fn factors(ways: &[[Way; 2]], lab: &[&[Plane; 3]]) -> Vec<Vec<f32>> {
-    let around: Vec<[Flow; 2]> =
-        ways.par_iter().map(|ways| ways.each_ref().map(|way| filled(&way.back, &way.trust))).collect();
+pub(super) fn factors(motions: &[[Motion; 2]], lab: &[&[Plane; 3]]) -> Vec<Vec<f32>> {
+    let around: Vec<[Flow; 2]> = motions
+        .par_iter()
+        .map(|pair| pair.each_ref().map(|motion| filled(&motion.back, &motion.trust)))
+        .collect();
     let of_frame = |frame: usize| {
         let pixels = lab[frame][0].data.len();
         let (before, after) = (FAR.min(frame), FAR.min(lab.len() - 1 - frame));
@@ -44,7 +46,7 @@ pub(super) fn factors(ways: &[[Way; 2]], lab: &[&[Plane; 3]]) -> Vec<Vec<f32>> {
         let back: Vec<&Flow> = (0..before).map(|k| &around[frame - 1 - k][0]).collect();
         let ahead: Vec<&Flow> = (0..after).map(|k| &around[frame + k][1]).collect();
         let factor = |pixel: usize| {
-            if ways[frame - 1][0].trust[pixel].min(ways[frame][1].trust[pixel]) > TRUSTED {
+            if motions[frame - 1][0].trust[pixel].min(motions[frame][1].trust[pixel]) > TRUSTED {
                 return 1.0;
             }
             let mut square = change(&back, lab[frame], lab[frame - before], pixel);
@@ -144,12 +146,12 @@ mod tests {
         let bright =
             |frame: usize| Plane::from_fn(SIDE, SIDE, |x, y| 80.0 * f32::from(u8::from(shows(frame, x, y))));
         let lab: Vec<[Plane; 3]> = (0..5).map(|frame| [0; 3].map(|_| bright(frame))).collect();
-        let way = |frame: usize| Way {
+        let motion = |frame: usize| Motion {
             back: still(),
             trust: Plane::from_fn(SIDE, SIDE, |x, y| f32::from(u8::from(!shows(frame, x, y)))).data,
         };
-        let ways: Vec<[Way; 2]> = (0..4).map(|k| [way(k + 1), way(k)]).collect();
-        let found = factors(&ways, &lab.iter().collect::<Vec<_>>());
+        let motions: Vec<[Motion; 2]> = (0..4).map(|k| [motion(k + 1), motion(k)]).collect();
+        let found = factors(&motions, &lab.iter().collect::<Vec<_>>());
         for (pixel, factor) in found[2].iter().enumerate() {
             let passes = shows(2, pixel % SIDE, pixel / SIDE);
             assert!(if passes { *factor < 0.2 } else { *factor > 0.9 }, "pixel {pixel}: {factor}");

@@ -4,7 +4,8 @@ use rayon::prelude::*;
 
 use super::agree::agreed;
 use super::belief::Belief;
-use super::window::{Seen, Way};
+use super::motion::Motion;
+use super::window::Seen;
 use crate::plane::Tap;
 
 /// Keeps every class possible when evidence is multiplied.
@@ -20,7 +21,7 @@ const LEAST_LOOKS: f32 = 25.0;
 /// Rounds in which pixels follow their neighbours.
 const ROUNDS: usize = 2;
 
-/// Distance, in pixels of the halved grid, over which a class may appear beside where motion brought it.
+/// Distance, in pixels of the halved grid, over which a class may appear next to where motion brought it.
 const SUPPORT: usize = 2;
 
 /// Inputs of a step besides the belief.
@@ -30,7 +31,7 @@ pub(super) struct Step<'a> {
     /// Rows of the frames.
     pub(super) height: usize,
     /// Motion from the known frame.
-    pub(super) way: &'a Way,
+    pub(super) motion: &'a Motion,
     /// The frame that is stepped to.
     pub(super) seen: &'a Seen,
 }
@@ -50,9 +51,9 @@ impl Step<'_> {
             |(y, (moved, reliability))| {
                 for x in 0..width {
                     let at = y * width + x;
-                    let (u, v) = (self.way.back.u.data[at], self.way.back.v.data[at]);
+                    let (u, v) = (self.motion.back.u.data[at], self.motion.back.v.data[at]);
                     let tap = Tap::new(width, self.height, x as f32 + u, y as f32 + v);
-                    reliability[x] = self.way.trust[at] * tap.of(&known.reliability);
+                    reliability[x] = self.motion.trust[at] * tap.of(&known.reliability);
                     tap.of_rows(&known.shares, classes, &mut moved[x * classes..(x + 1) * classes]);
                 }
             },
@@ -74,7 +75,7 @@ impl Step<'_> {
                     sum += *look;
                 }
                 let scale = 1.0 / sum.max(LEAST_LOOKS);
-                combine(&mut row[x * classes..(x + 1) * classes], &looks, scale, self.way.trust[at]);
+                combine(&mut row[x * classes..(x + 1) * classes], &looks, scale, self.motion.trust[at]);
             }
         });
         for _ in 0..ROUNDS {

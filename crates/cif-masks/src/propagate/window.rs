@@ -4,48 +4,17 @@ use std::ops::RangeInclusive;
 
 use rayon::prelude::*;
 
-use super::{Clip, scenery};
+use super::clip::Clip;
+use super::motion::Motion;
+use super::scenery;
 use crate::Error;
 use crate::appearance::{Features, Forest};
-use crate::flow::{Flow, Pyramid, flow};
+use crate::flow::{Pyramid, flow};
 use crate::picture::Picture;
-use crate::plane::{Plane, Tap};
-
-/// Disagreement of forward and backward flow at which motion is trusted by exp(-1/2), pixels.
-const DISAGREEMENT: f32 = 1.0;
-
-/// Change of colour along the flow at which motion is trusted by exp(-1/2), in the units of [`Picture::lab`].
-const RECOLORED: f32 = 25.0;
+use crate::plane::Plane;
 
 /// Standard deviation of the blur under which colours are compared, pixels.
 const COLOR_BLUR: f32 = 1.0;
-
-/// Motion from a frame to one of its neighbours.
-pub(super) struct Way {
-    /// Flow from the frame that is stepped to, back to the one that is known.
-    pub(super) back: Flow,
-    /// Per pixel of the frame that is stepped to, 0 to 1: how well the flow is to be trusted.
-    pub(super) trust: Vec<f32>,
-}
-
-impl Way {
-    /// `back` leads from the pixels of `to` into `from`, `forth` from there. What comes into sight has nothing to come
-    /// from: the flows contradict each other, or lead to something of another colour.
-    fn new(back: Flow, forth: &Flow, to: &[Plane; 3], from: &[Plane; 3]) -> Self {
-        let (width, height) = (back.u.width, back.u.height);
-        let trust = (0..width * height).map(|at| {
-            let (u, v) = (back.u.data[at], back.v.data[at]);
-            let tap = Tap::new(width, height, (at % width) as f32 + u, (at / width) as f32 + v);
-            let (du, dv) = (u + tap.of(&forth.u.data), v + tap.of(&forth.v.data));
-            let mut square = (du * du + dv * dv) / (DISAGREEMENT * DISAGREEMENT);
-            for (to, from) in to.iter().zip(from) {
-                square += ((to.data[at] - tap.of(&from.data)) / RECOLORED).powi(2);
-            }
-            (-0.5 * square).exp()
-        });
-        Self { trust: trust.collect(), back }
-    }
-}
 
 /// A frame of a window.
 struct Prepared {
@@ -58,8 +27,8 @@ struct Prepared {
 /// Facts about some frames in a row that propagation needs.
 pub(super) struct Window {
     first: usize,
-    /// Between each frame and the next: the way there, and the way back.
-    ways: Vec<[Way; 2]>,
+    /// Between each frame and the next: the motion forwards, and back.
+    motions: Vec<[Motion; 2]>,
     frames: Vec<Seen>,
 }
 
@@ -98,7 +67,7 @@ impl Window {
         for some in frames.chunks(at_once) {
             prepared.extend(some.par_iter().map(prepare).collect::<Result<Vec<_>, Error>>()?);
         }
-        let ways = prepared
+        let motions = prepared
             .par_windows(2)
             .map(|pair| {
                 if (clip.stop)() {
@@ -107,11 +76,12 @@ impl Window {
                 let (a, b) = (&pair[0], &pair[1]);
                 let (there, back) =
                     rayon::join(|| flow(&a.pyramid, &b.pyramid), || flow(&b.pyramid, &a.pyramid));
-                let to_later = Way::new(back.clone(), &there, &b.lab, &a.lab);
-                Ok([to_later, Way::new(there, &back, &a.lab, &b.lab)])
+                let to_later = Motion::new(back.clone(), &there, &b.lab, &a.lab);
+                Ok([to_later, Motion::new(there, &back, &a.lab, &b.lab)])
             })
-            .collect::<Result<Vec<[Way; 2]>, Error>>()?;
-        let factors = scenery::factors(&ways, &prepared.iter().map(|frame| &frame.lab).collect::<Vec<_>>());
+            .collect::<Result<Vec<[Motion; 2]>, Error>>()?;
+        let factors =
+            scenery::factors(&motions, &prepared.iter().map(|frame| &frame.lab).collect::<Vec<_>>());
         for (frame, factors) in prepared.iter_mut().zip(&factors) {
             let classes = frame.looks.len() / factors.len();
             for (looks, factor) in frame.looks.chunks_exact_mut(classes).zip(factors) {
@@ -119,31 +89,17 @@ impl Window {
             }
         }
         let frames = prepared.into_iter().map(|Prepared { lab, looks, .. }| Seen { looks, lab }).collect();
-        Ok(Self { first, ways, frames })
+        Ok(Self { first, motions, frames })
     }
 
     /// Motion from a frame to its neighbour.
-    pub(super) fn way(&self, from: usize, to: usize) -> &Way {
-        let [to_later, to_earlier] = &self.ways[from.min(to) - self.first];
+    pub(super) fn motion(&self, from: usize, to: usize) -> &Motion {
+        let [to_later, to_earlier] = &self.motions[from.min(to) - self.first];
         if from < to { to_later } else { to_earlier }
     }
 
     /// Looks and colours of a frame.
     pub(super) fn seen(&self, frame: usize) -> &Seen {
         &self.frames[frame - self.first]
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn flow_to_another_colour_is_not_trusted() {
-        // Flows that agree, over a pixel that changes its colour and one that keeps it.
-        let still = || Flow { u: Plane::filled(2, 1, 0.0), v: Plane::filled(2, 1, 0.0) };
-        let lab = |first: f32| [0; 3].map(|_| Plane { width: 2, height: 1, data: vec![first, 40.0] });
-        let trust = Way::new(still(), &still(), &lab(90.0), &lab(40.0)).trust;
-        assert!(trust[0] < 0.05 && trust[1] > 0.99, "{trust:?}");
     }
 }

@@ -16,7 +16,7 @@ from typing_extensions import Unpack
 __version__: str
 
 class CifError(Exception):
-    """A file, capture, field or stage is not as it should be; the message names it and the way out."""
+    """A file, capture, field or stage is invalid; the message names it and the remedy."""
 
 class Camera:
     """A pinhole camera: x right, y down, z forward; the centre of the first pixel is (0.5, 0.5).
@@ -90,7 +90,7 @@ class Dataset:
     ) -> dict[str, NDArray[Any] | None]:
         """Load image, uint8 `[H, W, 3]`, and mask, uint16 `[H, W]` (None without one), of a frame.
 
-        What is transparent in the image shows the background.
+        Transparent pixels show the background.
         """
     def show(self, index: int = 0, *, what: Literal["rgb", "instance-color"] = "rgb") -> Picture:
         """Draw a frame as a picture, which notebooks show.
@@ -142,7 +142,7 @@ class UsdOptions(TypedDict, total=False):
     """Options of USD files."""
 
     payloads: Literal["by-kind", "separate", "single-file"]
-    """Where the arrays of objects go: beside the stage, into it, or (by-kind) beside .usda alone."""
+    """Where the arrays of objects go: next to the stage, into it, or (by-kind) next to .usda alone."""
     levels_of_detail: bool
     """Add variants with half and a quarter of the splats; on by default."""
     ground: Literal["none", "auto"] | dict[Literal["at"], float]
@@ -344,7 +344,7 @@ def train(
     """Train a field on a capture, and return it.
 
     dataset is an opened capture or its folder. With output, a .cif file, the run is saved there every five minutes,
-    at the end of each stage and in the end, its settings beside it; without, it is only returned.
+    at the end of each stage and in the end, its settings next to it; without, it is only returned.
 
     preset is "draft", "standard" (the default) or "paper"; effects says which effects are trained, "auto" (as the
     capture calls for), "all" or "none", then single ones on or off, as in "auto,-instances". settings are single

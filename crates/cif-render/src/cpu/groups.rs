@@ -18,10 +18,10 @@ const CHUNK: usize = 512;
 struct Turn {
     /// World from group.
     rotation: DMat3,
-    /// Unit quaternion of the way back (w, x, y, z).
+    /// Unit quaternion of the inverse rotation (w, x, y, z).
     back: [f64; 4],
     pivot: DVec3,
-    /// Harmonics on the way back, where the group turns.
+    /// Harmonics of the inverse rotation, where the group turns.
     harmonics: Option<HarmonicsRotation<f32>>,
 }
 

@@ -3,7 +3,7 @@
 use cif_geometry::{PixelGrid, Real};
 
 use super::constant;
-use super::rasterize::{InstanceTarget, PixelState};
+use super::pixel::{InstanceTarget, PixelState};
 use crate::constants::MIN_LABEL_PROBABILITY;
 use crate::image::UNLABELLED;
 use crate::settings::InstanceNormalisation;

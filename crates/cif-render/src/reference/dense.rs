@@ -4,7 +4,7 @@
 use cif_geometry::{PixelGrid, Real};
 
 use super::constant;
-use super::identity::IdentityProbabilities;
+use super::identity_rows::IdentityProbabilities;
 use super::project::{Splat2d, SplatGradient};
 use super::rasterize::{covariance_backward, footprint, mean_backward, weight};
 use crate::constants::{MIN_LABEL_PROBABILITY, MIN_TRANSMITTANCE};

@@ -14,7 +14,9 @@
 //! | [`blend`] | other values per Gaussian, blended into an image |
 //! | [`cross_entropy`] | the instance loss |
 //! | [`dense`] | rendered identities of all instances: images, soft labels, oracle of the K-free form |
-//! | [`identity`] | identity distributions, their calibration gradient, label mass per Gaussian |
+//! | [`identity_rows`] | identity distributions, their calibration gradient |
+//! | [`pixel`] | a pixel after the forward pass, and its label |
+//! | [`identity`] | label mass per Gaussian |
 //! | [`render`] | the whole chain |
 //!
 //! Source: methods reference 2 to 5.1; notation as there: `v_x` is the gradient of the loss by x.
@@ -24,7 +26,9 @@ pub mod cross_entropy;
 pub mod deform;
 pub mod dense;
 pub mod identity;
+pub mod identity_rows;
 mod matrix;
+pub mod pixel;
 pub mod project;
 pub mod rasterize;
 pub mod render;
@@ -34,9 +38,10 @@ pub mod tracks;
 
 pub use blend::BlendGradients;
 pub use deform::Deformed;
-pub use identity::IdentityProbabilities;
+pub use identity_rows::IdentityProbabilities;
+pub use pixel::{InstanceTarget, PixelState};
 pub use project::{Splat2d, SplatGradient, View};
-pub use rasterize::{InstanceTarget, PixelState, RasterGradients};
+pub use rasterize::RasterGradients;
 pub use render::{Forward, SceneGradients, backward, count_identities, forward, render, splats_backward};
 pub use scene::{Gaussian, Parameters, Scene};
 

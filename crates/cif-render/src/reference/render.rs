@@ -7,12 +7,11 @@ use super::constant;
 use super::cross_entropy::{InstanceLoss, instance_loss};
 use super::deform::{Deformed, deform, deform_backward};
 use super::dense::{instance_image, rasterize_dense};
-use super::identity::{IdentityProbabilities, count_label_mass};
+use super::identity::count_label_mass;
+use super::identity_rows::IdentityProbabilities;
+use super::pixel::{InstanceTarget, PixelState};
 use super::project::{Splat2d, SplatGradient, View, project, project_backward};
-use super::rasterize::{
-    InstanceCotangent, InstanceTarget, PixelCotangents, PixelState, RasterGradients, rasterize,
-    rasterize_backward,
-};
+use super::rasterize::{InstanceCotangent, PixelCotangents, RasterGradients, rasterize, rasterize_backward};
 use super::scene::{Parameters, Scene};
 use super::sort::sort;
 use super::tracks::follow;

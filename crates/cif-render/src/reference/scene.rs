@@ -8,7 +8,7 @@ use cif_field::parameters::{
 use cif_field::{Deformation, Field, Tracks};
 use cif_geometry::Real;
 
-use super::identity::IdentityRows;
+use super::identity_rows::IdentityRows;
 
 /// Raw parameters of one Gaussian, canonical or moved to a time; also their gradient.
 #[derive(Clone, Debug, PartialEq)]

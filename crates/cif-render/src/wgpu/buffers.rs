@@ -12,7 +12,7 @@ use super::error::GpuError;
 const SMALLEST: u64 = 64;
 
 /// An array on the device. Growing drops its contents unless said otherwise, and makes bind groups of the old
-/// allocation stale: [`Self::generation`] tells.
+/// allocation stale: [`Self::generation`] changes.
 #[derive(Debug)]
 pub struct GpuVec<T> {
     label: &'static str,
@@ -451,7 +451,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_fault_that_is_told_stays() {
+    fn the_first_fault_that_is_reported_stays() {
         let Some(gpu) = crate::wgpu::testing::gpu() else { return };
         gpu.tell(GpuError::OutOfMemory("no room".to_owned()));
         gpu.tell(GpuError::Lost("later".to_owned()));

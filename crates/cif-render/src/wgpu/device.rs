@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
+use cif_system::environment::GPU_NAME;
+
 use super::error::GpuError;
 use super::features::GpuFeatures;
 use super::form::{Form, SubgroupUse};
@@ -108,7 +110,7 @@ fn missing(limits: &wgpu::Limits) -> Vec<String> {
         .collect()
 }
 
-/// The first fault that the driver told, kept until someone asks.
+/// The first fault that the driver reported, kept until it is asked for.
 type Fault = Arc<Mutex<Option<GpuError>>>;
 
 /// A module that the driver has compiled.
@@ -122,7 +124,7 @@ pub(super) struct CompiledModule {
     pub(super) pipelines: Vec<wgpu::ComputePipeline>,
 }
 
-/// What was compiled, by the name and the source of the module.
+/// Compiled kernels, by the name and the source of the module.
 type Compiled = Arc<Mutex<BTreeMap<(&'static str, String), CompiledModule>>>;
 
 /// A device with its queue and what was compiled for it. Clones share all.
@@ -146,7 +148,7 @@ impl Gpu {
 
     /// As [`Self::open_with`], with subgroups that have not been checked.
     pub(super) fn unchecked(features: GpuFeatures) -> Result<Self, GpuError> {
-        let wanted = std::env::var("WGPU_ADAPTER_NAME").unwrap_or_default();
+        let wanted = GPU_NAME.text().unwrap_or_default();
         let all = adapters();
         let names: Vec<String> = all.iter().map(|adapter| adapter.get_info().name).collect();
         let matches = |name: &str| name.to_lowercase().contains(&wanted.to_lowercase());
@@ -154,7 +156,7 @@ impl Gpu {
             let found = if names.is_empty() {
                 "nothing answered".to_owned()
             } else {
-                format!("{} does not contain WGPU_ADAPTER_NAME={wanted}", names.join(", "))
+                format!("{} does not contain {}={wanted}", names.join(", "), GPU_NAME.name())
             };
             return Err(GpuError::NoAdapter { backends: "Vulkan, Metal and Direct3D 12".to_owned(), found });
         };
@@ -214,7 +216,7 @@ impl Gpu {
         let kept = Arc::clone(&fault);
         device.set_device_lost_callback(move |_, message| {
             let mut fault = kept.lock().unwrap_or_else(PoisonError::into_inner);
-            // What a lost device rejects is told first, and is a consequence.
+            // Rejections by a lost device are reported before the loss, of which they are a consequence.
             if matches!(*fault, None | Some(GpuError::Rejected(_))) {
                 *fault = Some(GpuError::Lost(message));
             }
@@ -317,7 +319,7 @@ impl Gpu {
         match fault() {
             None => Ok(()),
             Some(GpuError::Rejected(message)) => {
-                // Whether the device is lost is told when it is asked; that it is, is then the fault.
+                // The loss of the device is reported when it is asked; it is then the fault.
                 let _ = self.device.poll(wgpu::PollType::Poll);
                 Err(fault().unwrap_or(GpuError::Rejected(message)))
             }

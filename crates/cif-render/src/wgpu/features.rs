@@ -1,5 +1,7 @@
 //! Optional features: used where an adapter has them, never required, and held back where that is asked.
 
+use cif_system::environment::GPU_FEATURES;
+
 use super::error::GpuError;
 
 /// Which optional features devices may use.
@@ -17,23 +19,23 @@ pub struct GpuFeatures {
 }
 
 impl GpuFeatures {
-    /// Whatever the adapter has.
+    /// All that the adapter has.
     pub const ALL: Self =
         Self { subgroups: true, software_subgroups: true, software_storage: true, timestamps: true };
-    /// Whatever the adapter has and is faster with.
-    pub const USUAL: Self = Self { software_subgroups: false, ..Self::ALL };
+    /// All that make the adapter faster.
+    pub const DEFAULT: Self = Self { software_subgroups: false, ..Self::ALL };
     /// The core of WebGPU alone.
     pub const NONE: Self =
         Self { subgroups: false, software_subgroups: false, software_storage: false, timestamps: false };
     /// The environment variable that holds features back.
-    pub const VARIABLE: &str = "CIF_GPU_FEATURES";
+    pub const VARIABLE: &str = GPU_FEATURES.name();
 
-    /// Features that [`Self::VARIABLE`] allows; [`Self::USUAL`] where it is not set.
+    /// Features that [`Self::VARIABLE`] allows; [`Self::DEFAULT`] where it is not set.
     ///
     /// # Errors
     /// When it names a feature that is not there.
     pub fn from_environment() -> Result<Self, GpuError> {
-        std::env::var(Self::VARIABLE).map_or(Ok(Self::USUAL), |text| Self::parse(&text))
+        GPU_FEATURES.text().map_or(Ok(Self::DEFAULT), |text| Self::parse(&text))
     }
 
     /// From `all`, `none`, or names separated by commas.

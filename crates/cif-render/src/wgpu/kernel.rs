@@ -500,7 +500,7 @@ mod tests {
             let rows = times.read(&gpu).unwrap();
             assert_eq!(rows.iter().map(|row| row.0).collect::<Vec<_>>(), ["direct", "indirect"]);
         }
-        // Growing keeps what it is told to keep.
+        // Growing keeps the values that it is asked to keep.
         let before = values.generation();
         assert!(values.resize_keeping(&gpu, 5000).unwrap() && values.generation() > before);
         assert_eq!(values.read_range(&gpu, 998, 4).unwrap(), [998 * 4, 999 * 4, 0, 0]);

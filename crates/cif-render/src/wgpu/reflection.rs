@@ -1,5 +1,5 @@
 //! Bindings and entry points of WGSL, as naga finds them: bind group layouts are made of these, so that no list of them
-//! is kept beside the file.
+//! is kept next to the file.
 
 use naga::{AddressSpace, StorageAccess};
 
@@ -94,8 +94,8 @@ mod tests {
     #[test]
     fn gaps_duplicates_and_other_groups_are_refused_by_name() {
         let fails = |declarations: &str, expected: &str| {
-            let told = of(declarations).unwrap_err();
-            assert!(told.contains(expected), "{expected} not in: {told}");
+            let message = of(declarations).unwrap_err();
+            assert!(message.contains(expected), "{expected} not in: {message}");
         };
         fails(
             "@group(0) @binding(1) var<uniform> late: vec4f;\n",

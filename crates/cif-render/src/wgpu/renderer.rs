@@ -104,8 +104,8 @@ impl GpuRenderer {
         self.packed_sh.is_some()
     }
 
-    /// Sets the memory that a band may take beside its (tile, Gaussian) pairs, in bytes, on the device and off it,
-    /// which decides how many rows are drawn at once. Pictures do not depend on it.
+    /// Sets the memory that a band may take in addition to its (tile, Gaussian) pairs, in bytes, on the device and off
+    /// it, which decides how many rows are drawn at once. Pictures do not depend on it.
     pub fn set_band_memory(&mut self, bytes: u64) {
         self.band_memory = bytes;
     }
@@ -207,12 +207,12 @@ impl GpuRenderer {
     }
 }
 
-/// Bytes of a pixel on the device, on the way back and in the image.
+/// Bytes of a pixel on the device, during the read-back and in the image.
 fn pixel_bytes(channels: Channels) -> u64 {
     let four = size_of::<[f32; 4]>();
     let depth = if channels.depth { 2 * four + size_of::<f32>() } else { 0 };
     let instances = if channels.instances { 4 * four + 4 * size_of::<f32>() } else { 0 };
-    // Colours and what is blended beside them, then colours on the way and in the image.
+    // Colours and what is blended next to them, then colours during the read-back and in the image.
     (2 * four + 3 * four + depth + instances) as u64
 }
 

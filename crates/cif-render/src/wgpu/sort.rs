@@ -174,7 +174,7 @@ impl RadixSort {
                 Count::Host(count) => Count::Host(16 * count.div_ceil(SORT_BLOCK)),
                 Count::Pairs => Count::Pairs,
             };
-            // A place of its own beside those of the sort.
+            // A place of its own, apart from those of the sort.
             let place = (name, pass + 100);
             scan.record(gpu, cache, stage, place, &arrays.digits, digits, arrays.digits.len(), counts)?;
             run(stage, &self.scatter);

@@ -81,7 +81,7 @@ impl DeviceSpeed {
     }
 }
 
-/// Time of a dispatch: of the device where it tells, else until it is done.
+/// Time of a dispatch: of the device where it has timestamps, else until it is done.
 fn timed(
     gpu: &Gpu,
     kernel: &Kernel,
@@ -95,11 +95,11 @@ fn timed(
     commands.submit();
     gpu.wait()?;
     let waited = start.elapsed();
-    let told = match &timestamps {
+    let on_device = match &timestamps {
         Some(timestamps) => timestamps.read(gpu)?.first().map(|(_, time)| *time),
         None => None,
     };
-    Ok(told.filter(|time| !time.is_zero()).unwrap_or(waited))
+    Ok(on_device.filter(|time| !time.is_zero()).unwrap_or(waited))
 }
 
 #[cfg(test)]

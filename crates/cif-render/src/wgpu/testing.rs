@@ -1,5 +1,7 @@
 //! The GPU that tests run on: `CIF_TEST_GPU=off|auto|require`.
 
+use cif_system::environment::TEST_GPU;
+
 use super::device::Gpu;
 use super::features::GpuFeatures;
 use super::form::Form;
@@ -11,7 +13,7 @@ use super::form::Form;
 /// Under `require` without a GPU, and for other values.
 #[must_use]
 pub fn gpu() -> Option<Gpu> {
-    let wish = std::env::var("CIF_TEST_GPU").unwrap_or_else(|_| "auto".to_owned());
+    let wish = TEST_GPU.text().unwrap_or_else(|| "auto".to_owned());
     match wish.as_str() {
         "off" => {
             eprintln!("skipped: CIF_TEST_GPU=off");

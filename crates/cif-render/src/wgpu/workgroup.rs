@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_numbers_are_told() {
+    fn wrong_numbers_are_reported() {
         let locals = 0..INVOCATIONS as u32;
         let sum = |of: fn(u32) -> f32| locals.clone().map(of).sum::<f32>().to_bits();
         let sums =
@@ -130,8 +130,8 @@ mod tests {
         let fails = |at: usize, value: [u32; 4], expected: &str| {
             let mut wrong = right.clone();
             wrong[at] = value;
-            let told = differences(&wrong).unwrap_or_default();
-            assert!(told.contains(expected), "{expected} not in: {told}");
+            let message = differences(&wrong).unwrap_or_default();
+            assert!(message.contains(expected), "{expected} not in: {message}");
         };
         fails(0, [sums[0], sums[1], sums[2], sums[3] + 1], "sums of a workgroup");
         fails(3 * 9 + 1, right[3 * 8 + 1], "taken");

@@ -2,7 +2,7 @@
 //! then the fast path and the GPU against the reference.
 //!
 //! Differences are taken where the loss is smooth, see `gradients.rs` for what is skipped. Pixels in the boundary
-//! band, see `agreement.rs`, carry no gradient and are not compared.
+//! band, see `views.rs`, carry no gradient and are not compared.
 
 use cif_field::parameters::{Parameter, TABLE};
 use cif_geometry::PixelGrid;
@@ -328,10 +328,10 @@ fn check_fast_path(
     config: &SyntheticConfig,
     settings: RenderSettings,
     channels: usize,
-    edit: impl Fn(&mut SyntheticScene),
+    edit: &dyn Fn(&mut SyntheticScene),
 ) {
     for blending in BOTH {
-        let expected = expected(config, settings, (channels, blending), &PATHS, &edit);
+        let expected = expected(config, settings, (channels, blending), &PATHS, edit);
         let (head, field) = (&expected.head, &expected.scene.field);
         let (values, v_blended) = (single(&head.values), single(&head.v_blended));
         let request = head.request(&values);
@@ -373,37 +373,65 @@ fn check_fast_path(
     }
 }
 
-#[test]
-fn fast_path_with_few_and_many_channels() {
-    for channels in [1, 3, 16, 100] {
-        check_fast_path("static", &many(), settings(), channels, |_| {});
+/// Compares what a renderer blends, and its gradients, with the reference: name of the case, scene, settings, channels,
+/// and changes to the scene.
+type Compare = fn(&str, &SyntheticConfig, RenderSettings, usize, &dyn Fn(&mut SyntheticScene));
+
+/// Tests that every renderer has.
+mod suite {
+    use cif_render::synthetic::SyntheticConfig;
+    use cif_render::{InstanceSettings, OccupancySource, RenderSettings};
+
+    use super::{Compare, many, settings};
+
+    pub(super) fn values_of_few_and_many_channels(compare: Compare) {
+        for channels in [1, 3, 4, 16, 100, 101] {
+            compare("static", &many(), settings(), channels, &|_| {});
+        }
+    }
+
+    pub(super) fn weights_that_saturate_and_pixels_that_stop(compare: Compare) {
+        let config = SyntheticConfig { gaussians: 60, screen_size: (0.05, 0.4), ..many() };
+        compare("saturated", &config, settings(), 3, &|scene| {
+            for row in 0..60 {
+                scene.field.gaussians.opacity_logits[row] = if row % 2 == 0 { 7.0 } else { 1.0 };
+                scene.field.gaussians.occupancy_logits[row] = if row % 3 == 0 { 7.0 } else { 0.0 };
+            }
+        });
+    }
+
+    pub(super) fn opacity_instead_of_occupancy(compare: Compare) {
+        let instances =
+            InstanceSettings { occupancy: OccupancySource::Opacity, ..InstanceSettings::default() };
+        for antialiased in [false, true] {
+            let settings = RenderSettings { antialiased, instances: Some(instances), ..settings() };
+            compare("opacity as occupancy", &many(), settings, 3, &|_| {});
+        }
     }
 }
+
+/// All tests of [`suite`] for a renderer.
+macro_rules! blend_suite {
+    ($module:ident, $compare:path) => {
+        mod $module {
+            crate::support::tests_of!(
+                $compare;
+                values_of_few_and_many_channels,
+                weights_that_saturate_and_pixels_that_stop,
+                opacity_instead_of_occupancy,
+            );
+        }
+    };
+}
+
+blend_suite!(on_processor, super::check_fast_path);
+#[cfg(feature = "wgpu")]
+blend_suite!(on_gpu, super::gpu::check);
 
 #[test]
 fn fast_path_of_a_deformed_scene() {
     let config = SyntheticConfig { heads: Some(ALL_HEADS), ..many() };
-    check_fast_path("deformed", &config, settings(), 5, |_| {});
-}
-
-#[test]
-fn fast_path_where_weights_saturate_and_pixels_stop() {
-    let config = SyntheticConfig { gaussians: 60, screen_size: (0.05, 0.4), ..many() };
-    check_fast_path("saturated", &config, settings(), 3, |scene| {
-        for row in 0..60 {
-            scene.field.gaussians.opacity_logits[row] = if row % 2 == 0 { 7.0 } else { 1.0 };
-            scene.field.gaussians.occupancy_logits[row] = if row % 3 == 0 { 7.0 } else { 0.0 };
-        }
-    });
-}
-
-#[test]
-fn fast_path_of_every_setting() {
-    let instances = InstanceSettings { occupancy: OccupancySource::Opacity, ..InstanceSettings::default() };
-    for antialiased in [false, true] {
-        let settings = RenderSettings { antialiased, instances: Some(instances), ..settings() };
-        check_fast_path("opacity as occupancy", &many(), settings, 3, |_| {});
-    }
+    check_fast_path("deformed", &config, settings(), 5, &|_| {});
 }
 
 /// Blended image and gradients of a head, with so many threads and so much memory for a band.
@@ -562,16 +590,16 @@ mod gpu {
         Ok(Outcome { blended: blended.read(gpu)?, v_values: v_values.read(gpu)?, posed })
     }
 
-    fn check(
+    pub(super) fn check(
         name: &str,
         config: &SyntheticConfig,
         settings: RenderSettings,
         channels: usize,
-        edit: impl Fn(&mut SyntheticScene),
+        edit: &dyn Fn(&mut SyntheticScene),
     ) {
         let Some(mut device) = device() else { return };
         for blending in BOTH {
-            let expected = expected(config, settings, (channels, blending), &PATHS, &edit);
+            let expected = expected(config, settings, (channels, blending), &PATHS, edit);
             let mut mismatches = Mismatches::default();
             let frozen = run(&mut device, &expected, &settings, &[None]).expect("the view is drawn");
             expected.compare_image(&frozen.blended, 3e-5, &mut mismatches);
@@ -597,32 +625,6 @@ mod gpu {
             }
             mismatches.finish(&format!("{name}, C = {channels}, {blending:?}"));
         }
-    }
-
-    #[test]
-    fn few_and_many_channels() {
-        for channels in [1, 3, 4, 16, 101] {
-            check("on the GPU", &many(), settings(), channels, |_| {});
-        }
-    }
-
-    #[test]
-    fn weights_that_saturate_and_pixels_that_stop() {
-        let config = SyntheticConfig { gaussians: 60, screen_size: (0.05, 0.4), ..many() };
-        check("saturated on the GPU", &config, settings(), 3, |scene| {
-            for row in 0..60 {
-                scene.field.gaussians.opacity_logits[row] = if row % 2 == 0 { 7.0 } else { 1.0 };
-                scene.field.gaussians.occupancy_logits[row] = if row % 3 == 0 { 7.0 } else { 0.0 };
-            }
-        });
-    }
-
-    #[test]
-    fn opacity_as_occupancy() {
-        let instances =
-            InstanceSettings { occupancy: OccupancySource::Opacity, ..InstanceSettings::default() };
-        let settings = RenderSettings { antialiased: true, instances: Some(instances), ..settings() };
-        check("opacity as occupancy on the GPU", &many(), settings, 3, |_| {});
     }
 
     #[test]

@@ -13,10 +13,10 @@ use cif_render::wgpu::{
     testing,
 };
 
-use crate::agreement::{BAND, CHANNELS, Expected, Tolerances, config, settings};
 use crate::on_gpu::{Outcome, device, run};
 use crate::renderers::{Path, seen_on_gpu};
 use crate::support::{Cotangents, Mismatches, Worst, pixel_discontinuity, render};
+use crate::views::{BAND, CHANNELS, Expected, Tolerances, config, settings};
 
 #[test]
 fn project_on_the_inputs_of_the_reference() {

@@ -5,7 +5,8 @@
 //! |---|---|
 //! | `support` | random cotangents, scenes clear of discontinuities, comparison of numbers, finite differences |
 //! | `renderers` | a training view through every renderer, in one form |
-//! | `agreement` | every renderer against the reference in double precision, over settings and scenes |
+//! | `views` | a training view through every renderer against the reference in double precision: tests that each has |
+//! | `agreement` | pictures, counts and single properties of renderers against the reference |
 //! | `hard_cases` | numerically hard cases, the table of `tests/README.md` |
 //! | `gradients` | the reference against finite differences |
 //! | `instances` | the instance pass of the reference, worked out by hand |
@@ -31,3 +32,4 @@ mod on_gpu;
 mod renderers;
 mod support;
 mod tracks;
+mod views;

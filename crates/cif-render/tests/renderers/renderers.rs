@@ -47,25 +47,35 @@ impl Seen {
     }
 }
 
+/// A view through the levels or devices of a renderer.
+pub(crate) type RenderView = fn(&SyntheticScene, &RenderSettings, &Cotangents) -> Vec<Seen>;
+
 /// The view through every renderer that there is here.
 pub(crate) fn everywhere(
     scene: &SyntheticScene,
     settings: &RenderSettings,
     cotangents: &Cotangents,
 ) -> Vec<Seen> {
-    let mut all = on_processor(scene, settings, cotangents);
-    all.extend(on_gpu(scene, settings, cotangents));
-    all
+    let all: [RenderView; 3] = [on_reference, on_processor, on_gpu];
+    all.iter().flat_map(|renderer| renderer(scene, settings, cotangents)).collect()
 }
 
-/// The view through every renderer but the GPU.
+/// The view through the reference in single precision.
+pub(crate) fn on_reference(
+    scene: &SyntheticScene,
+    settings: &RenderSettings,
+    cotangents: &Cotangents,
+) -> Vec<Seen> {
+    vec![single(scene, settings, cotangents)]
+}
+
+/// The view through the fast path at every level of vector instructions.
 pub(crate) fn on_processor(
     scene: &SyntheticScene,
     settings: &RenderSettings,
     cotangents: &Cotangents,
 ) -> Vec<Seen> {
-    let levels = SimdLevel::available().into_iter().map(|simd| fast(simd, scene, settings, cotangents));
-    std::iter::once(single(scene, settings, cotangents)).chain(levels).collect()
+    SimdLevel::available().into_iter().map(|simd| fast(simd, scene, settings, cotangents)).collect()
 }
 
 fn single(synthetic: &SyntheticScene, settings: &RenderSettings, cotangents: &Cotangents) -> Seen {
@@ -73,7 +83,7 @@ fn single(synthetic: &SyntheticScene, settings: &RenderSettings, cotangents: &Co
     let forward = render(&scene, synthetic, settings);
     let gradients = cotangents.backward(&scene, &forward);
     let state = &forward.pixels.pixels;
-    let blended = |s: &cif_render::reference::rasterize::PixelState<f32>| {
+    let blended = |s: &cif_render::reference::PixelState<f32>| {
         [s.transmittance, s.depth, s.label_probability, s.instance_transmittance].map(f64::from)
     };
     Seen {
@@ -132,11 +142,16 @@ pub(crate) fn fast_gradient(gradients: &Gradients, parameter: Parameter, index: 
     f64::from(tensor.expect("a parameter of the table").1[index])
 }
 
-/// The view on the GPU, where there is one.
+/// The view on the GPU; empty where there is none.
 #[cfg(feature = "wgpu")]
-fn on_gpu(scene: &SyntheticScene, settings: &RenderSettings, cotangents: &Cotangents) -> Option<Seen> {
-    let mut device = crate::on_gpu::device()?;
-    Some(seen_on_gpu(crate::on_gpu::run(&mut device, scene, settings, cotangents, |_| {}).unwrap()))
+pub(crate) fn on_gpu(
+    scene: &SyntheticScene,
+    settings: &RenderSettings,
+    cotangents: &Cotangents,
+) -> Vec<Seen> {
+    let Some(mut device) = crate::on_gpu::device() else { return Vec::new() };
+    let seen = crate::on_gpu::run(&mut device, scene, settings, cotangents, |_| {}).unwrap();
+    vec![seen_on_gpu(seen)]
 }
 
 /// Results that were read back from the GPU, in the common form.
@@ -159,6 +174,6 @@ pub(crate) fn seen_on_gpu(seen: crate::on_gpu::Outcome) -> Seen {
 }
 
 #[cfg(not(feature = "wgpu"))]
-fn on_gpu(_: &SyntheticScene, _: &RenderSettings, _: &Cotangents) -> Option<Seen> {
-    None
+fn on_gpu(_: &SyntheticScene, _: &RenderSettings, _: &Cotangents) -> Vec<Seen> {
+    Vec::new()
 }

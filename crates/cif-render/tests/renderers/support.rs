@@ -375,3 +375,16 @@ pub(crate) fn plain_camera(width: u32, height: u32, focal_px: f64) -> PinholeCam
         camera_from_world: cif_geometry::RigidTransform::IDENTITY,
     }
 }
+
+/// Makes tests of the functions of the module `suite` next to this one, which take a renderer.
+macro_rules! tests_of {
+    ($renderer:path; $($test:ident),+ $(,)?) => {
+        $(
+            #[test]
+            fn $test() {
+                super::suite::$test($renderer);
+            }
+        )+
+    };
+}
+pub(crate) use tests_of;

@@ -34,7 +34,7 @@ pub(super) fn author(
         poses.push(PoseSample { time_code: *time_code, translation: view.translation, rotation });
     }
     transforms::order(pxr, &prim)?;
-    // A camera that never moves needs no samples; when it was recorded stands beside them.
+    // A camera that never moves needs no samples; the time of its recording is an attribute of its own.
     let moves = poses
         .iter()
         .any(|pose| pose.translation != poses[0].translation || pose.rotation != poses[0].rotation);
@@ -60,7 +60,7 @@ pub(super) fn author(
     let clipping = first.1.clipping_range;
     let clipping = pxr.gf.call_method1("Vec2f", (clipping.x, clipping.y))?;
     prim.set("clippingRange", "Float2", VARYING, clipping)?;
-    // Apertures give no resolution: the captured one stands beside them.
+    // Apertures give no resolution: the captured one is an attribute of its own.
     for (name, pixels) in
         [(tokens::IMAGE_WIDTH, last.camera.width), (tokens::IMAGE_HEIGHT, last.camera.height)]
     {

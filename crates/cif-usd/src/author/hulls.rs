@@ -13,7 +13,7 @@ pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, place: &str, 
     for (index, (hull, mass)) in node.colliders.iter().zip(masses).enumerate() {
         let part = hull.part.zip(node.motion.parts()).and_then(|(part, motion)| motion.parts.get(part));
         let place = part.map_or_else(|| place.to_owned(), |part| child(place, &part.name));
-        // The number tells the order over all parts.
+        // The number gives the order over all parts.
         let name = match index {
             0 => tokens::COLLIDER.to_owned(),
             _ => format!("{}_{index:02}", tokens::COLLIDER),

@@ -114,7 +114,7 @@ fn instance_shares(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, identities: &[Identit
     let ids: Vec<i32> = entries().map(|entry| i32::from(entry.id)).collect();
     let mut shares: Vec<f32> = entries().map(|entry| entry.share).collect();
     if places == 1 {
-        // Validators ask for indices of whatever has one value per splat, and cannot tell of more.
+        // Validators ask for indices of whatever has one value per splat, and know no other case.
         let (unique, indices) = primvars::without_repetitions(shares.as_chunks::<1>().0);
         shares = unique.into_flattened();
         set_indices(pxr, prim, tokens::PRIMVAR_INSTANCE_SHARES, indices)?;

@@ -102,16 +102,16 @@ fn pose<'py>(
     Ok(pose.map_or((track.rest.translation, track.rest.rotation), |pose| (pose.translation, pose.rotation)))
 }
 
-/// The pinhole camera, with the recorded height where there is one: apertures tell it only to rounding.
+/// The pinhole camera, with the recorded height where there is one: apertures give it only to rounding.
 fn camera(usd: &UsdCamera, width: u32, height: Option<u32>) -> PinholeCamera {
-    let told = conventions::pinhole_camera(usd, width);
-    let Some(height) = height.filter(|&height| height != told.height) else { return told };
+    let camera = conventions::pinhole_camera(usd, width);
+    let Some(height) = height.filter(|&height| height != camera.height) else { return camera };
     let per_pixel = usd.aperture / DVec2::new(f64::from(width), f64::from(height));
     let shift = DVec2::new(usd.aperture_offset.x, -usd.aperture_offset.y) / per_pixel;
     PinholeCamera {
         height,
         focal_px: DVec2::splat(usd.focal_length) / per_pixel,
         principal_px: DVec2::new(f64::from(width), f64::from(height)) / 2.0 - shift,
-        ..told
+        ..camera
     }
 }

@@ -72,9 +72,9 @@ fn authored(attribute: &Bound<'_, PyAny>) -> PyResult<String> {
     let mut prim = attribute.call_method0("GetPrim")?;
     let mut name = own;
     while name.is_empty() && prim.is_truthy()? {
-        if let Some(told) = values::attribute(&prim, "colorSpace:name")? {
-            let told = told.call_method0("Get")?;
-            name = if told.is_none() { name } else { text(&told)? };
+        if let Some(attribute) = values::attribute(&prim, "colorSpace:name")? {
+            let value = attribute.call_method0("Get")?;
+            name = if value.is_none() { name } else { text(&value)? };
         }
         prim = prim.call_method0("GetParent")?;
     }

@@ -190,7 +190,7 @@ impl<'a, 'py> Frames<'a, 'py> {
     ) -> PyResult<Option<Track>> {
         let chain = self.chain(prim, end)?;
         if end.is_none() && self.scene_from_world.is_some() {
-            // What stands beside our root, or below it where it was moved, is seen from the world.
+            // What stands next to our root, or below it where it was moved, is seen from the world.
             let top = chain.last().map_or(Ok(false), |top| self.is_root(top))?;
             if !top {
                 return Ok(None);
@@ -262,7 +262,7 @@ impl<'a, 'py> Frames<'a, 'py> {
         Ok(Some((Track { rest, samples }, false)))
     }
 
-    /// Transform from a splat prim to the frame of its node; `None` where it collapses. `exact` tells whether the
+    /// Transform from a splat prim to the frame of its node; `None` where it collapses. `exact` says whether the
     /// track is that of the owner without loss.
     pub(super) fn placement(
         &self,

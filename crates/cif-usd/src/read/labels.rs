@@ -118,7 +118,7 @@ impl<'a, 'py> DirectLabels<'a, 'py> {
 }
 
 /// A label of the schema `SemanticsAPI` of earlier tools, of which a prim may have several:
-/// `semantic:NAME:params:semanticType` is the taxonomy, `semanticData` or `semanticLabel` beside it the label.
+/// `semantic:NAME:params:semanticType` is the taxonomy, `semanticData` or `semanticLabel` next to it the label.
 pub(crate) struct Older<'py> {
     pub(crate) taxonomy: String,
     pub(crate) label: String,

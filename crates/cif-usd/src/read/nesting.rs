@@ -1,4 +1,4 @@
-//! Nesting depth of the brackets of a text layer, told before usd-core parses it: its parser calls itself once per
+//! Nesting depth of the brackets of a text layer, checked before usd-core parses it: its parser calls itself once per
 //! level, and a stack that runs out ends the process.
 
 use std::fs::File;

@@ -83,7 +83,7 @@ pub(super) fn read<'py>(reading: &Reading<'_, 'py>, owner: &Owner<'py>) -> Resul
         category,
         taxonomies: labels::others(reading.pxr, &owner.prim).map_err(python)?,
         embedding: labels::embedding(reading.pxr, &owner.prim).map_err(python)?,
-        // Of what stands still the transform tells the pivot.
+        // The transform of an object without motion is its pivot.
         pivot: recorded.pivot.filter(|_| !track.samples.is_empty()),
         track,
         proxy: proxy(reading, owner, in_parts, splats)?,

@@ -336,7 +336,7 @@ impl<'py> SplatPrim<'py> {
         self.harmonics(reading, &at, n)
     }
 
-    /// The instances that every splat may belong to; empty where the prim does not tell.
+    /// The instances that every splat may belong to; empty where the prim has none.
     fn identities(
         &self,
         reading: &Reading<'_, 'py>,

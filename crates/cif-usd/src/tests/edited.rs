@@ -90,7 +90,7 @@ op.Set(op.Get() + Gf.Vec3d(2, 0, 0))
         assert!((b.translation - a.translation - DVec3::X * 0.02).length() < 1e-9, "{a:?} {b:?}");
         assert!((b.rotation - a.rotation).to_cols_array().iter().all(|v| v.abs() < 1e-6));
     }
-    // What is added beside the root is placed in the world.
+    // What is added next to the root is placed in the world.
     let (before, after) = edited_at(
         frame,
         "

@@ -82,13 +82,13 @@ for name in 'ab':
 Sdf.CopySpec(stage.GetRootLayer(), '/World/Thing/Cloud', stage.GetRootLayer(), '/World/Loose')
 ",
     );
-    let told: Vec<_> = graph
+    let found: Vec<_> = graph
         .nodes
         .iter()
         .map(|node| (node.name.as_str(), node.label.as_str(), node.category.as_str(), node.splats.len()))
         .collect();
     assert_eq!(
-        told,
+        found,
         [
             ("Thing", "my mug", "mug", 2),
             ("Other", "Grandma", "cup", 2),
@@ -275,9 +275,10 @@ for name, purpose in [('Drawn', 'render'), ('Light', 'proxy'), ('Help', 'guide')
     );
     assert_eq!(graph.nodes.len(), 2);
     assert!(graph.nodes.iter().all(|node| node.splats.len() == 2));
-    let told: Vec<&String> = graph.warnings.iter().filter(|warning| warning.contains("purpose")).collect();
-    assert_eq!(told.len(), 2, "{:?}", graph.warnings);
-    assert!(told[0].starts_with("/World/Light/Cloud: its purpose is proxy"), "{told:?}");
+    let purposes: Vec<&String> =
+        graph.warnings.iter().filter(|warning| warning.contains("purpose")).collect();
+    assert_eq!(purposes.len(), 2, "{:?}", graph.warnings);
+    assert!(purposes[0].starts_with("/World/Light/Cloud: its purpose is proxy"), "{purposes:?}");
 }
 
 #[test]
@@ -297,12 +298,12 @@ fn colours_of_other_spaces_become_display_values() {
         (api("prim", "raw"), 0.2, 0),
         (api("prim", "my_own"), 0.2, 1),
     ];
-    for (says, expected, told) in cases {
+    for (says, expected, count) in cases {
         let graph = read(&format!("{linear}{says}"));
         let found = color(&graph);
         assert!(found.iter().all(|value| (value - expected).abs() < 1e-4), "{says}: {found:?}");
         let warnings = graph.warnings.iter().filter(|warning| warning.contains("colour")).count();
-        assert_eq!(warnings, told, "{says}: {:?}", graph.warnings);
+        assert_eq!(warnings, count, "{says}: {:?}", graph.warnings);
     }
     // Another primary is another colour, and colours of any numbers are taken by their range.
     let graph =

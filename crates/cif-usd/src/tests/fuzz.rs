@@ -3,6 +3,7 @@
 use std::fs;
 use std::panic::catch_unwind;
 
+use cif_system::environment::FUZZ_STAGES;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 
@@ -47,7 +48,7 @@ fn damaged_stages_are_read_or_refused_by_name() {
         ExportOptions { payloads: Payloads::SingleFile, levels_of_detail: false, ..Default::default() };
     export(&Maker::new(5).scene(), &path, options).unwrap();
     let text = fs::read_to_string(&path).unwrap();
-    let cases = std::env::var("CIF_FUZZ_STAGES").ok().and_then(|cases| cases.parse().ok()).unwrap_or(CASES);
+    let cases = FUZZ_STAGES.text().and_then(|cases| cases.parse().ok()).unwrap_or(CASES);
     for seed in 0..cases {
         let mut chance = Pcg64::seed_from_u64(seed);
         // USD keeps layers by their names.
@@ -55,8 +56,8 @@ fn damaged_stages_are_read_or_refused_by_name() {
         fs::write(&path, damaged(&text, &mut chance)).unwrap();
         let read = catch_unwind(|| read_scene(&path)).unwrap_or_else(|_| panic!("seed {seed} panics"));
         if let Err(error) = read {
-            let told = error.to_string();
-            assert!(told.contains(&format!("damaged_{seed}.usda")), "seed {seed}: {told}");
+            let message = error.to_string();
+            assert!(message.contains(&format!("damaged_{seed}.usda")), "seed {seed}: {message}");
         }
         fs::remove_file(&path).unwrap();
     }

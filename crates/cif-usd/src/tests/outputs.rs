@@ -1,4 +1,4 @@
-//! Where stages go: links stay what they are, and nothing unfinished stays beside them.
+//! Where stages go: links stay what they are, and nothing unfinished stays next to them.
 #![cfg(unix)]
 
 use std::fs;
@@ -25,7 +25,7 @@ fn links_stay_and_their_targets_are_written() {
     let scene = Maker::new(3).scene();
     let options = ExportOptions::default();
 
-    // Payloads lie beside the target, which is also beside the link.
+    // Payloads lie next to the target, which is also next to the link.
     symlink("v2.usda", at("scene.usda")).unwrap();
     for _ in 0..2 {
         export(&scene, &at("scene.usda"), options).unwrap();

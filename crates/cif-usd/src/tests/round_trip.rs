@@ -86,8 +86,8 @@ fn the_evidence_for_rotations_stands_on_the_prim() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.usda");
     let mut scene = Maker::new(9).scene();
-    let told = [Some(RotationEvidence::Observed), Some(RotationEvidence::Assumed), None];
-    scene.nodes.iter_mut().zip(told).for_each(|(node, rotation)| node.report.rotation = rotation);
+    let evidence = [Some(RotationEvidence::Observed), Some(RotationEvidence::Assumed), None];
+    scene.nodes.iter_mut().zip(evidence).for_each(|(node, rotation)| node.report.rotation = rotation);
     export(&scene, &path, ExportOptions::default()).unwrap();
     let names: Vec<&str> = scene.nodes.iter().map(|node| node.name.as_str()).take(3).collect();
     let program = format!(
@@ -106,7 +106,7 @@ stage.Save()
     // Of what the prim and its report say, the prim counts.
     let read = read_scene(&path).unwrap();
     let read: Vec<_> = read.nodes.iter().map(|node| node.report.rotation).take(3).collect();
-    assert_eq!(read, [told[1], told[1], None]);
+    assert_eq!(read, [evidence[1], evidence[1], None]);
 }
 
 #[test]
@@ -175,7 +175,7 @@ fn a_far_scene_stands_in_the_world_of_its_capture() {
         let head = text.split("def Xform \"red_mug_001\"").next().unwrap();
         assert_eq!(head.contains("double3 xformOp:translate"), !frame.is_identity(), "{head}");
         assert_eq!(head.contains("double3 xformOp:scale"), frame.scale != 1.0, "{head}");
-        // Queries of the stage and of the graph tell the same places, in the world.
+        // Queries of the stage and of the graph give the same places in the world.
         let wanted = LabelQuery { pattern: "*".into(), time_code: Some(graph.time_codes.start()) };
         let (stage, scene) = (
             crate::query(&path, &wanted, ReadOptions::default()).unwrap(),
@@ -227,8 +227,8 @@ fn a_stage_that_is_placed_nowhere_is_refused() {
     let scale = "double captureScale = 0.001";
     assert!(text.contains(scale));
     std::fs::write(&path, text.replace(scale, "double captureScale = -1")).unwrap();
-    let told = read_scene(&path).unwrap_err().to_string();
-    assert!(told.contains("/World") && told.contains("captureScale"), "{told}");
+    let message = read_scene(&path).unwrap_err().to_string();
+    assert!(message.contains("/World") && message.contains("captureScale"), "{message}");
 }
 
 #[test]

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use cif_system::environment::BUILD_PYTHON;
+
 use super::{python, session};
 use crate::tokens;
 
@@ -81,7 +83,7 @@ if installed:
     bare.AddAppliedSchema('CifInstanceAPI')
     assert bare.GetAttribute('cif:kind').Get() == 'instance' and bare.GetAttribute('cif:index').Get() == -1
 ";
-    let program = std::env::var("PYO3_PYTHON").unwrap_or_else(|_| "python3".to_owned());
+    let program = BUILD_PYTHON.text().unwrap_or_else(|| "python3".to_owned());
     for (plugins, case) in [(repository().join("plugin/usd"), "installed"), (PathBuf::new(), "missing")] {
         let output = std::process::Command::new(&program)
             .args(["-c", look])

@@ -44,7 +44,7 @@ impl Session {
         let [declared_inputs, declared_outputs] = place.open(&file).map_err(|problem| {
             Error::refused(
                 format!("{} cannot be loaded: {problem}", file.display()),
-                "give an ONNX model for the processor, with the files of its data beside it",
+                "give an ONNX model for the processor, with the files of its data next to it",
             )
         })?;
         let side = |word, declared, named, parts| Side { word, declared, named, parts };

@@ -73,8 +73,7 @@ pub(super) fn bind(file: &Path, side: Side<'_>) -> Result<Bound, Error> {
     let has: Vec<String> =
         declared.iter().map(|one| format!("{} {} {}", one.name, one.type_name, one.shape_text())).collect();
     let has = if has.is_empty() { "none".to_owned() } else { has.join(", ") };
-    let fix =
-        format!("{word}s of {file}: {has}; correct {MANIFEST}, or export the model with what is needed");
+    let fix = format!("{word}s of {file}: {has}; correct {MANIFEST}, or export the model with them");
     let refuse = |problem: String| Err(Error::refused(problem, fix.clone()));
     if let Some(part) = parts.iter().find(|part| part.needed && !named.contains_key(part.name)) {
         return refuse(format!("{MANIFEST} does not say which {word} of {file} is `{}`", part.name));
@@ -140,27 +139,27 @@ mod tests {
         let both = [pixels.clone(), mask.clone()];
         let named = [("image", "pixels"), ("mask", "mask")];
         assert_eq!(bound(&both, &named, "input").unwrap()["image"], pixels);
-        let told = |declared: &[Declared], named: &[(&str, &str)], word, words: &[&str]| {
+        let refuses = |declared: &[Declared], named: &[(&str, &str)], word, words: &[&str]| {
             let problem = bound(declared, named, word).unwrap_err();
             assert!(words.iter().all(|word| problem.contains(word)), "{problem}");
         };
-        told(&both, &named[..1], "input", &["no part for the input `mask`"]);
-        told(&both, &named[1..], "input", &["which input", "`image`"]);
-        told(&both, &[("image", "pixel"), named[1]], "input", &["no input `pixel`", "for `image`"]);
-        told(&both, &[("image", "pixels"), ("masks", "mask")], "input", &["`masks`", "knows image, mask"]);
-        told(
+        refuses(&both, &named[..1], "input", &["no part for the input `mask`"]);
+        refuses(&both, &named[1..], "input", &["which input", "`image`"]);
+        refuses(&both, &[("image", "pixel"), named[1]], "input", &["no input `pixel`", "for `image`"]);
+        refuses(&both, &[("image", "pixels"), ("masks", "mask")], "input", &["`masks`", "knows image, mask"]);
+        refuses(
             &[declared("pixels", Element::Other, &[None; 4])],
             &named[..1],
             "input",
             &["`pixels`", "f32, i64"],
         );
-        told(
+        refuses(
             &[declared("pixels", Element::Int64, &[None; 4])],
             &named[..1],
             "output",
             &["`pixels`", "where f32"],
         );
-        told(
+        refuses(
             &[declared("pixels", Element::Float, &[None, Some(3)])],
             &named[..1],
             "input",

@@ -243,10 +243,12 @@ mod tests {
     #[cfg(unix)]
     #[test]
     fn a_process_that_ends_is_an_error() {
-        for (script, told) in [("kill -SEGV $$", "signal: 11"), ("read -r line; exit 3", "exit status: 3")] {
+        for (script, expected) in
+            [("kill -SEGV $$", "signal: 11"), ("read -r line; exit 3", "exit status: 3")]
+        {
             let mut worker = Worker::start(Command::new("sh").args(["-c", script])).unwrap();
             let problem = worker.ask(&Question::Read("text".to_owned()), Vec::new()).unwrap_err();
-            assert!(problem.contains(told), "{problem}");
+            assert!(problem.contains(expected), "{problem}");
         }
     }
 }

@@ -1,6 +1,6 @@
 //! `cif check`: whether a scene is numerically sound, and a repaired copy of one that is not.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use cif_field::health::{self, Finding, Repair, Severity};
 use cif_field::{Checkpoint, Field, StateTensor};
@@ -8,13 +8,14 @@ use cif_geometry::{PinholeCamera, PixelGrid};
 use cif_render::UNLABELLED;
 use cif_render::cpu::{IdentityCounts, Renderer, SimdLevel};
 use clap::Args;
-use serde_json::{Value, json};
+use serde::Serialize;
+use serde_json::Value;
 
 use super::shared::scene;
 use crate::endings;
 use crate::error::Error;
 use crate::output::Outputs;
-use crate::report::Report;
+use crate::report::{JsonReport, Report};
 
 /// Blended weight over all recorded views, in pixels, below which a Gaussian was never seen.
 const MIN_MASS: f64 = 1e-3;
@@ -22,8 +23,8 @@ const MIN_MASS: f64 = 1e-3;
 /// Report whether a scene is numerically sound, and repair it
 #[derive(Debug, Args)]
 #[command(after_help = "\
-Broken is what cif cannot load, draw or train: values that are not finite, quaternions of norm 0,
-log-scales beyond what the renderer clamps. Odd is what is drawn as asked and may still be a mistake:
+Broken scenes cannot be loaded, drawn or trained: values that are not finite, quaternions of norm 0,
+log-scales beyond what the renderer clamps. Odd scenes are drawn as they are, and may hold a mistake:
 saturated opacity or occupancy, needles, copies, Gaussians that no recorded view shows, centres
 outside the box of the deformation or far from the cameras.
 
@@ -31,8 +32,8 @@ outside the box of the deformation or far from the cameras.
   cif check table.cif --json | jq '.findings[] | {check, array, count}'
   cif check broken.cif --fix repaired.cif
 
---fix repairs what is broken into a new file and leaves what is odd: what is drawn stays as it was
-drawn, so that Gaussians which cannot be drawn are removed and clamped values take their limits.
+--fix writes a copy without the broken values and leaves odd ones: views stay the same, so that
+Gaussians that cannot be drawn are removed, and values beyond the clamps are set to them.
 Exit code: 0 sound (or repaired), 1 broken.")]
 pub(super) struct Check {
     /// Trained scene
@@ -60,7 +61,7 @@ pub(super) fn run(command: &Check) -> Result<(), Error> {
     command.fix.as_deref().map_or(Ok(()), |target| outputs.file(target))?;
     command.report.check(&mut outputs)?;
     if command.scene.is_dir() {
-        // The usual words for a capture in place of a scene.
+        // Reports a capture in place of a scene as other commands do.
         scene::load(&command.scene)?;
     }
     let mut checkpoint = Checkpoint::load_unchecked(&command.scene).map_err(Error::plain)?;
@@ -81,17 +82,15 @@ pub(super) fn run(command: &Check) -> Result<(), Error> {
         })?;
         checkpoint.save(target).map_err(Error::plain)?;
     }
-    let report = || {
-        json!({
-            "scene": command.scene,
-            "gaussians": gaussians,
-            "broken": broken,
-            "odd": findings.len() - broken,
-            "views_checked": never_seen.is_some(),
-            "findings": findings,
-            "repaired": command.fix,
-            "repairs": repairs,
-        })
+    let report = || CheckReport {
+        scene: &command.scene,
+        gaussians,
+        broken,
+        odd: findings.len() - broken,
+        views_checked: never_seen.is_some(),
+        findings: &findings,
+        repaired: command.fix.as_deref(),
+        repairs: &repairs,
     };
     let views = never_seen.is_some();
     command.report.give(report, || print(command, gaussians, &findings, &repairs, views))?;
@@ -114,6 +113,31 @@ pub(super) fn run(command: &Check) -> Result<(), Error> {
             ])
         ),
     ))
+}
+
+/// Findings on a scene.
+#[derive(Serialize)]
+struct CheckReport<'a> {
+    /// The scene.
+    scene: &'a Path,
+    /// Gaussians.
+    gaussians: usize,
+    /// Findings that mean that the scene is broken.
+    broken: usize,
+    /// Findings that may have a reason.
+    odd: usize,
+    /// True where the views of the scene were searched for Gaussians that none shows.
+    views_checked: bool,
+    /// Every finding.
+    findings: &'a [Finding],
+    /// The repaired copy; null without `--fix`.
+    repaired: Option<&'a Path>,
+    /// Changes of the copy.
+    repairs: &'a [Repair],
+}
+
+impl JsonReport for CheckReport<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif check"];
 }
 
 /// Most pixels of a view in which Gaussians are looked for: 4096 x 4096, which take about 1 GiB. Larger views are
@@ -173,7 +197,7 @@ fn repair(checkpoint: &mut Checkpoint) -> Result<Vec<Repair>, health::HealthErro
     let mut zeroed = 0;
     if !fits && checkpoint.training.take().is_some() {
         repairs.push(Repair {
-            what: "the training state was left out, since it is of other Gaussians; cif train --from goes on"
+            what: "the training state was left out, since it belongs to other Gaussians; cif train --from continues"
                 .to_owned(),
             count: 1,
         });
@@ -215,7 +239,7 @@ fn print(command: &Check, gaussians: usize, findings: &[Finding], repairs: &[Rep
         println!("{table}");
     }
     if !views {
-        println!("not told: which Gaussians no view shows, since the scene is broken or records no views");
+        println!("not checked: Gaussians that no view shows, since the scene is broken or records no views");
     }
     for Repair { what, count } in repairs {
         println!("repaired: {count} x {what}");

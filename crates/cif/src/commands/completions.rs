@@ -1,9 +1,8 @@
 //! `cif completions`: what shells complete command lines by.
 
-use clap::{Args, CommandFactory};
+use clap::Args;
 use clap_complete::Shell;
 
-use super::Arguments;
 use crate::error::Error;
 
 /// Print the completions of a shell
@@ -22,9 +21,10 @@ pub(super) struct Completions {
     shell: Shell,
 }
 
-pub(super) fn run(command: &Completions) -> Result<(), Error> {
+/// `arguments` is the parser of the command line.
+pub(super) fn run(command: &Completions, mut arguments: clap::Command) -> Result<(), Error> {
     let mut script = Vec::new();
-    clap_complete::generate(command.shell, &mut Arguments::command(), "cif", &mut script);
+    clap_complete::generate(command.shell, &mut arguments, "cif", &mut script);
     print!("{}", String::from_utf8_lossy(&script));
     Ok(())
 }

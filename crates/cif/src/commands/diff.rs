@@ -4,17 +4,17 @@ use std::path::PathBuf;
 
 use cif_scene::SceneDiff;
 use clap::Args;
-use serde_json::json;
+use serde::Serialize;
 
 use crate::error::Error;
 use crate::formats;
-use crate::report::OnlyReport;
+use crate::report::{JsonReport, OnlyReport};
 
 /// Show what differs between two scenes, object by object
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Objects are matched by id, else by name. Distances are in world units, the largest over time. A scene
-is compared as it would be exported; beside an exported file, with the options of that export.
+is compared as it would be exported; with an exported file, with the options of that export.
 
   cif diff table.cif table.usda
   cif diff before.glb after.glb --json")]
@@ -29,11 +29,20 @@ pub(super) struct Diff {
     pub(super) report: OnlyReport,
 }
 
+/// Differences of two scenes.
+#[derive(Serialize)]
+#[serde(transparent)]
+pub(super) struct Changes<'a>(pub(super) &'a SceneDiff);
+
+impl JsonReport for Changes<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif diff", "cif import --base"];
+}
+
 pub(super) fn run(command: &Diff) -> Result<(), Error> {
     command.report.check([command.before.as_path(), command.after.as_path()])?;
     let [before, after] = formats::read_both(&command.before, &command.after)?;
     let changes = cif_scene::diff::diff(&before, &after);
-    command.report.give(|| json!(changes), || print_changes(&changes))
+    command.report.give(|| Changes(&changes), || print_changes(&changes))
 }
 
 /// The differences as a table, one line each.

@@ -1,17 +1,17 @@
 //! `cif embed`: what objects look like, for questions in words.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use cif_dataset::{Dataset, Split};
-use cif_field::{Checkpoint, Embeddings, Field};
+use cif_field::{Checkpoint, Embeddings, Field, Instance};
 use cif_geometry::PixelGrid;
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::{Channels, RenderSettings};
 use cif_vision::embedding::{PictureEmbedder, unit};
 use cif_vision::{Models, library};
 use clap::Args;
-use serde_json::json;
+use serde::Serialize;
 
 use super::shared::scene;
 use crate::commands::shared::{CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings};
@@ -22,15 +22,15 @@ use crate::lock::Lock;
 use crate::messages::is_quiet;
 use crate::output::Outputs;
 use crate::progress::FrameProgress;
-use crate::report::Report;
+use crate::report::{JsonReport, Report};
 use crate::{endings, interrupt};
 
-/// Keep what objects look like, so that cif query --text finds them by meaning
+/// Store an embedding of every object, so that cif query --text finds objects by meaning
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Every object is cut out of the captured training views that show most of it, and a model such as CLIP
 makes an embedding of each; their mean is kept in the scene, and in stages that are exported from it
-afterwards, as cif:embedding. The file is written anew beside itself and then takes its own place.
+afterwards, as cif:embedding. The file is written to a temporary file in the same folder, which then replaces it.
 
   cif embed table.cif --capture captures/table --models models
   cif export table.cif --usd table.usda
@@ -116,12 +116,12 @@ pub(super) fn run(command: &Embed) -> Result<(), Error> {
     }
     checkpoint.field.record.embeddings = Some(Embeddings { model: name.to_owned(), of: embeddings });
     checkpoint.save(target).map_err(Error::plain)?;
-    let report = || {
-        let views = views
-            .iter()
-            .map(|(instance, views)| json!({ "id": instance.id, "label": instance.label, "views": views }));
-        json!({ "scene": target, "model": name, "instances": views.collect::<Vec<_>>() })
+    let seen = |(instance, views): &(Instance, usize)| SeenInstance {
+        id: instance.id,
+        label: instance.label.clone(),
+        views: *views,
     };
+    let report = || EmbedReport { scene: target, model: name, instances: views.iter().map(seen).collect() };
     command.report.give(report, || {
         let mut table = crate::commands::shared::table(["id", "label", "views"]);
         for (instance, views) in &views {
@@ -130,6 +130,32 @@ pub(super) fn run(command: &Embed) -> Result<(), Error> {
         println!("{table}");
         println!("{}: embeddings by {name}", target.display());
     })
+}
+
+/// Embeddings that were added to a scene.
+#[derive(Serialize)]
+struct EmbedReport<'a> {
+    /// File that was written.
+    scene: &'a Path,
+    /// Model that made the embeddings.
+    model: &'a str,
+    /// Instances of the scene.
+    instances: Vec<SeenInstance>,
+}
+
+/// An instance and the views that show it.
+#[derive(Serialize)]
+struct SeenInstance {
+    /// Mask id.
+    id: u16,
+    /// Label.
+    label: String,
+    /// Views whose mean its embedding is; 0 where it has none.
+    views: usize,
+}
+
+impl JsonReport for EmbedReport<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif embed"];
 }
 
 /// The training views of a scene.

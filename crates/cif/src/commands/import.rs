@@ -1,12 +1,13 @@
 //! `cif import`: files of other tools as scenes, and edits coming home.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
+use cif_field::{Field, Instance};
 use cif_scene::ReadOptions;
 use clap::Args;
-use serde_json::json;
+use serde::Serialize;
 
-use super::diff::{cameras, print_objects};
+use super::diff::{Changes, cameras, print_objects};
 use super::shared::scene;
 use crate::endings;
 use crate::error::Error;
@@ -14,9 +15,9 @@ use crate::formats;
 use crate::lock::Lock;
 use crate::messages::{note, outcome};
 use crate::output::Outputs;
-use crate::report::Report;
+use crate::report::{JsonReport, Report};
 
-/// Turn USD, glTF or PLY into a scene, or bring edits of an exported file home
+/// Turn USD, glTF or PLY into a scene, or apply the edits of an exported file to its scene
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Without --base the file becomes a scene of its own: splats, objects with their labels, motion as the
@@ -86,7 +87,7 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
         None => {
             if graph.origin.field_fingerprint.is_some() {
                 note!(
-                    "cif exported this file; give the scene it came from with --base to keep what was learned"
+                    "cif exported this file; give the scene that it was exported from with --base to keep the learned motion"
                 );
             }
             formats::field_of(&graph, &command.file)?
@@ -94,20 +95,10 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
     };
     let _lock = Lock::wait(&command.output)?;
     field.save(&command.output).map_err(Error::plain)?;
-    let report = || match &edits {
-        Some(changes) => json!(changes),
-        None => json!({
-            "scene": command.output,
-            "gaussians": field.len(),
-            "instances": field.instances,
-            "times": field.timeline.times.len(),
-        }),
-    };
-    command.report.give(report, || {
-        if let Some(changes) = &edits {
-            print_objects(changes);
-        }
-    })?;
+    match &edits {
+        Some(changes) => command.report.give(|| Changes(changes), || print_objects(changes))?,
+        None => command.report.give(|| ImportReport::of(&command.output, &field), || ())?,
+    }
     outcome!(
         "wrote {}: {} Gaussians, {} instances, {} times",
         command.output.display(),
@@ -116,6 +107,30 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
         field.timeline.times.len()
     );
     Ok(())
+}
+
+/// A scene made of a file of another format.
+#[derive(Serialize)]
+struct ImportReport<'a> {
+    /// The scene.
+    scene: &'a Path,
+    /// Gaussians.
+    gaussians: usize,
+    /// Instances.
+    instances: &'a [Instance],
+    /// Times.
+    times: usize,
+}
+
+impl<'a> ImportReport<'a> {
+    fn of(scene: &'a Path, field: &'a Field) -> Self {
+        let (gaussians, times) = (field.len(), field.timeline.times.len());
+        Self { scene, gaussians, instances: &field.instances, times }
+    }
+}
+
+impl JsonReport for ImportReport<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif import"];
 }
 
 fn import_error(error: &cif_scene::SceneError) -> Error {

@@ -6,18 +6,18 @@ use cif_dataset::meant::meant;
 use cif_field::{Checkpoint, Instance};
 use cif_scene::naming::instance_name;
 use clap::Args;
-use serde_json::json;
+use serde::Serialize;
 
 use crate::error::Error;
 use crate::formats::Content;
 use crate::lock::Lock;
 use crate::output::Outputs;
-use crate::report::Report;
+use crate::report::{JsonReport, Report};
 
 /// Give an object another label
 #[derive(Debug, Args)]
 #[command(after_help = "\
-The file is written anew beside itself and then takes its own place; nothing is lost when that fails.
+The file is written to a temporary file in the same folder, which then replaces it; nothing is lost when that fails.
 Prims of a stage keep their names and paths; what changes is the semantic class label, the display
 name and userProperties:label. In glTF it is `extras.cif`; nodes of other programs get another name.
 
@@ -67,7 +67,7 @@ pub(super) fn run(command: &Label) -> Result<(), Error> {
     let target = command.output.as_deref().unwrap_or(&command.path);
     // From before it is read, so that no other change is lost.
     let _lock = Lock::wait(target)?;
-    let Renamed { object, before, label, category } = match content {
+    let renamed = match content {
         Content::Field => in_scene(&command.path, target, &command.instance, label, category)?,
         Content::Graph(format) => {
             let done = format.relabel(&command.path, target, &command.instance, label, category);
@@ -76,13 +76,32 @@ pub(super) fn run(command: &Label) -> Result<(), Error> {
         }
     };
     let report = || {
-        json!({
-            "file": target, "object": object, "before": before, "label": label, "category": category,
-        })
+        let Renamed { object, before, label, category } = &renamed;
+        LabelReport { file: target, object, before, label, category }
     };
     command.report.give(report, || {
+        let Renamed { object, before, label, category } = &renamed;
         println!("{}: '{before}' is now '{label}', class '{category}' ({object})", target.display());
     })
+}
+
+/// An object that got another label.
+#[derive(Serialize)]
+struct LabelReport<'a> {
+    /// File that was written.
+    file: &'a Path,
+    /// The object: path of its prim, name of its node, or `id N` in a .cif.
+    object: &'a str,
+    /// Label that it had.
+    before: &'a str,
+    /// Label that it has now.
+    label: &'a str,
+    /// Class that it has now.
+    category: &'a str,
+}
+
+impl JsonReport for LabelReport<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif label"];
 }
 
 /// An object with its names, before and now.

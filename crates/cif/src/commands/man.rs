@@ -2,10 +2,9 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, CommandFactory};
+use clap::Args;
 use clap_mangen::Man as Page;
 
-use super::Arguments;
 use crate::endings;
 use crate::error::Error;
 use crate::messages::outcome;
@@ -25,8 +24,9 @@ pub(super) struct Man {
     force: bool,
 }
 
-pub(super) fn run(command: &Man) -> Result<(), Error> {
-    let mut root = Arguments::command().disable_help_subcommand(true);
+/// `arguments` is the parser of the command line.
+pub(super) fn run(command: &Man, arguments: clap::Command) -> Result<(), Error> {
+    let mut root = arguments.disable_help_subcommand(true);
     root.build();
     let mut pages = Vec::new();
     collect(&root, &mut pages)?;

@@ -20,9 +20,9 @@ mod render;
 pub(crate) mod shared;
 mod train;
 
-use cif_render::cpu::SimdLevel;
-use clap::builder::{EnumValueParser, TypedValueParser};
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use std::ffi::OsString;
+
+use clap::{Args, CommandFactory, Parser, Subcommand};
 
 #[cfg(feature = "wgpu")]
 use crate::backend;
@@ -45,7 +45,7 @@ pub struct Arguments {
     command: Command,
     #[command(flatten)]
     machine: Machine,
-    /// Show no progress, notes or outcomes; warnings, errors and what was asked for stay
+    /// Show no progress, notes or outcomes, but warnings, errors and results
     #[arg(short, long, global = true)]
     quiet: bool,
 }
@@ -59,7 +59,7 @@ A short tour:
   cif train captures/table -o table.cif                  train it (--preset draft for a quick look)
   cif eval table.cif captures/table --images pictures    score the held-out views, and look at them
   cif export table.cif table.usda                        one moving prim per object
-  cif import table.usda --base table.cif -o new.cif      edits of that file come home
+  cif import table.usda --base table.cif -o new.cif      apply the edits of that file
   cif query table.usda --label 'red mug' --time 36       which prim is it, and where?
   cif query table.usda --text 'something to drink from'  what could that be? (with cif embed, by meaning)
   cif label table.usda --instance 3 'blue mug'           give it another name
@@ -67,15 +67,15 @@ A short tour:
 
 A capture is a folder in the layout of HyperNeRF, DyCheck, Neu3D, D-NeRF, Dynamic 3D Gaussians (CMU
 Panoptic), LLFF sequences (NSFF, EndoNeRF), nerfstudio or COLMAP, with instance masks (PNG, value =
-instance id, 0 = unlabelled; or Cryptomatte EXR) in its folder masks/ or beside its images.
+instance id, 0 = unlabelled; or Cryptomatte EXR) in its folder masks/ or next to its images.
 `cif masks` makes them out of those of other tools, a few painted frames, or with a video tracker.
 
 Times are frames as captured, which are the time codes of exported stages: --time 36. Seconds after the
 first frame have an s (--time 1.5s), shares of the whole a percent sign (--time 50%).
 --json prints the report of a command as JSON and nothing else on stdout; --json FILE.json writes it.
-Tables fold to the width of the terminal, and do not where they are piped.
+Tables are folded to the width of the terminal, but not in a pipe.
 Existing files are replaced with --force only. -q leaves out progress, notes and outcomes.
-Exit code: 0 done, 1 failed, 2 not understood, 130 interrupted.
+Exit code: 0 done, 1 failed, 2 wrong arguments, 130 interrupted.
 `cif COMMAND --help` explains one command.";
 
 #[derive(Debug, Subcommand)]
@@ -110,55 +110,6 @@ struct Machine {
     /// Threads to use; all processors by default. Results do not depend on it
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     threads: Option<u32>,
-}
-
-/// Vector instructions of the renderer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum Simd {
-    /// The widest that the processor has
-    Auto,
-    /// AVX-512, as of Ice Lake
-    Avx512,
-    /// AVX2 with FMA
-    Avx2,
-    /// Baseline instructions of this kind of processor
-    Portable,
-}
-
-impl Simd {
-    /// Parses a level and refuses those that this processor lacks.
-    fn parser() -> impl TypedValueParser<Value = Self> {
-        EnumValueParser::<Self>::new().try_map(|simd| {
-            if SimdLevel::from(simd).is_available() {
-                return Ok(simd);
-            }
-            let available =
-                Self::value_variants().iter().filter(|simd| SimdLevel::from(**simd).is_available());
-            let names: Vec<&str> = available.map(|simd| simd.name()).collect();
-            Err(format!("this processor does not have these instructions; it has {}", names.join(", ")))
-        })
-    }
-
-    /// As it is typed.
-    fn name(self) -> &'static str {
-        match self {
-            Self::Auto => "auto",
-            Self::Avx512 => "avx512",
-            Self::Avx2 => "avx2",
-            Self::Portable => "portable",
-        }
-    }
-}
-
-impl From<Simd> for SimdLevel {
-    fn from(simd: Simd) -> Self {
-        match simd {
-            Simd::Auto => Self::Auto,
-            Simd::Avx512 => Self::Avx512,
-            Simd::Avx2 => Self::Avx2,
-            Simd::Portable => Self::Portable,
-        }
-    }
 }
 
 impl Arguments {
@@ -198,7 +149,7 @@ pub fn run(arguments: Arguments) -> Result<(), Error> {
 
 /// Advice on arguments that were not understood, where the message of the parser has none.
 #[must_use]
-pub fn advice(error: &clap::Error, arguments: &[std::ffi::OsString]) -> Option<String> {
+pub fn advice(error: &clap::Error, arguments: &[OsString]) -> Option<String> {
     match error.get(clap::error::ContextKind::InvalidArg)? {
         clap::error::ContextValue::String(word) => report::advice(arguments, word),
         _ => None,
@@ -208,7 +159,7 @@ pub fn advice(error: &clap::Error, arguments: &[std::ffi::OsString]) -> Option<S
 /// Runs one command on the threads that are there.
 fn dispatch(command: Command) -> Result<(), Error> {
     match command {
-        Command::Make(command) => make::run(&command),
+        Command::Make(command) => make::run(&command, run_line),
         Command::Capture(command) => capture::run(&command),
         Command::Plan(command) => plan::run(&command),
         Command::Train(command) => train::run(&command),
@@ -224,9 +175,14 @@ fn dispatch(command: Command) -> Result<(), Error> {
         Command::Check(command) => check::run(&command),
         Command::Masks(command) => masks::run(&command),
         Command::Bench(command) => bench::run(&command),
-        Command::Completions(command) => completions::run(&command),
-        Command::Man(command) => man::run(&command),
+        Command::Completions(command) => completions::run(&command, Arguments::command()),
+        Command::Man(command) => man::run(&command, Arguments::command()),
         Command::RunModel => cif_vision::runtime::serve(std::io::stdin().lock(), std::io::stdout().lock())
             .map_err(|error| Error::plain(format!("no process asks for a model any more: {error}"))),
     }
+}
+
+/// Runs the command of a command line.
+fn run_line(line: Vec<OsString>) -> Result<(), Error> {
+    dispatch(Arguments::try_parse_from(line).map_err(Error::plain)?.command)
 }

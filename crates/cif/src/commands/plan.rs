@@ -4,18 +4,18 @@ use std::path::PathBuf;
 
 use cif_train::{EffectChoice, EffectPlan, TrainConfig};
 use clap::Args;
-use serde_json::json;
 
+use crate::commands::shared::named::preset;
 use crate::commands::shared::{CaptureOptions, print_warnings};
 use crate::error::Error;
-use crate::report::OnlyReport;
+use crate::report::{JsonReport, OnlyReport};
 
-/// Show which effects a capture calls for, and what they cost
+/// Show which effects a capture needs, and their cost
 #[derive(Debug, Args)]
 #[command(after_help = "\
 `cif train` follows this plan (unless the preset is paper, or --effects says otherwise) and records it in the scene.
-Each line tells the flag of `cif train` that decides otherwise; settings that are typed or in a
---config file win over the plan.
+Each line names the flag of `cif train` that overrides it; settings on the command line or in a
+--config file override the plan.
 
   cif plan captures/table
   cif train captures/table -o table.cif --effects auto,-instances")]
@@ -35,14 +35,18 @@ pub(super) struct Plan {
     capture_options: CaptureOptions,
 }
 
+impl JsonReport for EffectPlan {
+    const COMMANDS: &'static [&'static str] = &["cif plan"];
+}
+
 pub(super) fn run(command: &Plan) -> Result<(), Error> {
     command.report.check([command.capture.as_path()])?;
-    let preset = super::train::preset(&command.preset, "--preset")?;
+    let preset = preset(&command.preset, "--preset")?;
     let dataset = command.capture_options.open(&command.capture)?;
     print_warnings(&dataset);
     let config = TrainConfig::preset(preset, dataset.layout);
     let plan = EffectPlan::new(&dataset, &config, &command.effects).map_err(Error::plain)?;
-    command.report.give(|| json!(plan), || print(&plan))
+    command.report.give(|| plan.clone(), || print(&plan))
 }
 
 fn print(plan: &EffectPlan) {

@@ -16,7 +16,7 @@ use std::time::Duration;
 
 use cif_dataset::masks::{flat_name, found_masks};
 
-use super::{Asked, Detected, temporary};
+use super::asked::{Asked, Detected, temporary};
 use crate::error::Error;
 use crate::interrupt;
 use crate::mask_query::FoundMasks;

@@ -10,7 +10,7 @@ use cif_vision::cache::{self, Cache};
 use cif_vision::grounding::Thresholds;
 use cif_vision::{Models, Prompter};
 
-use super::{Asked, Detected, temporary};
+use super::asked::{Asked, Detected, temporary};
 use crate::error::Error;
 use crate::interrupt;
 use crate::mask_query::FoundMasks;

@@ -1,4 +1,4 @@
-//! Frames beside their masks, many on one picture.
+//! Frames next to their masks, many on one picture.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -11,7 +11,7 @@ use crate::error::Error;
 /// Columns of pixels of a frame on the sheet at most.
 const WIDTH: u32 = 320;
 
-/// Frames beside each other.
+/// Frames next to each other.
 const COLUMNS: usize = 3;
 
 /// Rows of white between two rows of frames.
@@ -30,7 +30,7 @@ impl ContactSheet {
         Self::default()
     }
 
-    /// Adds a frame beside its mask; frames lie in the order of their indices.
+    /// Adds a frame next to its mask; frames lie in the order of their indices.
     ///
     /// # Panics
     /// When image and mask differ in size.
@@ -46,7 +46,7 @@ impl ContactSheet {
         self.tiles.insert(index, side_by_side(&[small(image), small(&colors)]));
     }
 
-    /// The picture: rows of frames beside their masks.
+    /// The picture: rows of frames next to their masks.
     #[must_use]
     pub fn finish(self) -> Picture {
         let tiles: Vec<Picture> = self.tiles.into_values().collect();

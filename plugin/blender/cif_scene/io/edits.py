@@ -1,7 +1,7 @@
 """A layer over a stage that says what changed: what an artist did, without touching the stage itself.
 
 The layer has the stage as its sublayer, so that opening the layer shows the edited scene, and
-`cif import LAYER --base scene.cif` brings the edits home. Values are written beside samples, because simulators
+`cif import LAYER --base scene.cif` brings the edits home. Values are written next to samples, because simulators
 and validators read the default time.
 """
 
@@ -45,7 +45,7 @@ class Edit:
     path: str
     """Prim of the stage."""
     copy_name: str | None = None
-    """Wanted name of a copy beside that prim; the edit then describes the copy."""
+    """Wanted name of a copy next to that prim; the edit then describes the copy."""
     deleted: bool = False
     track: Track | None = None
     """New poses as `Instance` has them, or in the frame of the instance for a part."""

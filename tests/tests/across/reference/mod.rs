@@ -2,14 +2,29 @@
 //! `CIF_WRITE_DOCS=1`, which `make docs` sets.
 
 mod commands;
+mod environment;
+mod json;
 mod python;
 mod settings;
+mod source;
 
 use std::path::Path;
+
+use cif_system::environment::WRITE_DOCS;
 
 #[test]
 fn commands_are_as_in_the_reference() {
     check("commands.md", &commands::page());
+}
+
+#[test]
+fn environment_variables_are_as_in_the_reference() {
+    check("environment.md", &environment::page());
+}
+
+#[test]
+fn json_outputs_are_as_in_the_reference() {
+    check("json.md", &json::page(&source::Sources::read()));
 }
 
 #[test]
@@ -26,7 +41,7 @@ fn python_is_as_in_the_reference() {
 fn check(name: &str, page: &str) {
     let folder = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/reference"));
     let path = folder.join(name);
-    if std::env::var("CIF_WRITE_DOCS").is_ok_and(|value| value == "1") {
+    if WRITE_DOCS.text().is_some_and(|value| value == "1") {
         std::fs::create_dir_all(folder).unwrap();
         cif::output::write_file(&path, page.as_bytes()).unwrap();
         return;

@@ -29,8 +29,8 @@ impl Queries {
     }
 
     fn texts(&self) -> Vec<TextTable> {
-        let line = |Line { title, way, cells, published }: Line| TextLine {
-            texts: vec![title, way.name().to_owned()],
+        let line = |Line { title, rule, cells, published }: Line| TextLine {
+            texts: vec![title, rule.name().to_owned()],
             numbers: cells.iter().map(shown).collect(),
             published,
         };

@@ -26,7 +26,7 @@ use crate::records::Measurement;
 /// Rule by which a scene answers a question.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Way {
+pub enum Rule {
     /// The instances that have the most words of the question in their labels, classes and taxonomies.
     Labels,
     /// Those inside the masks that models make of the question on training frames.
@@ -37,7 +37,7 @@ pub enum Way {
     Relevance,
 }
 
-impl Way {
+impl Rule {
     /// All of them, in the order of tables.
     pub const ALL: [Self; 4] = [Self::Labels, Self::Reproject, Self::Grouping, Self::Relevance];
 
@@ -65,7 +65,7 @@ pub struct Answer {
     /// The question.
     pub question: String,
     /// Rule by which it was answered.
-    pub by: Way,
+    pub by: Rule,
     /// Percent of pixels that agree; `None` where no held-out frame shows the answer.
     pub macc: Option<f64>,
     /// Mean intersection over union, percent.
@@ -74,7 +74,7 @@ pub struct Answer {
     pub frames: usize,
     /// Held-out frames with a mask that do not, which do not count.
     pub empty_frames: usize,
-    /// Ids of the instances that were chosen; empty where none was, and with [`Way::Relevance`], which asks pixels.
+    /// Ids of the instances that were chosen; empty where none was, and with [`Rule::Relevance`], which asks pixels.
     pub chosen: Vec<u16>,
 }
 
@@ -83,7 +83,7 @@ pub struct Answer {
 pub struct Answers {
     /// Everything that they depend on: another value makes them void.
     pub fingerprint: MadeFrom,
-    /// By question, then by way.
+    /// By question, then by rule.
     pub answers: Vec<Answer>,
 }
 
@@ -118,13 +118,13 @@ pub struct Queries {
     pub missing: Vec<Missing>,
 }
 
-/// A number of a line, and whether it is the best of its column among lines of the same way.
+/// A number of a line, and whether it is the best of its column among lines of the same rule.
 pub(super) type Cell = (Mean, bool);
 
-/// Scores of a head by one way.
+/// Scores of a head by one rule.
 pub(super) struct Line {
     pub(super) title: String,
-    pub(super) way: Way,
+    pub(super) rule: Rule,
     /// mAcc and mIoU of every question, then of all.
     pub(super) cells: Vec<Cell>,
     /// Published numbers, in words.
@@ -168,21 +168,21 @@ impl Queries {
         columns.push(&all);
         headings.push("mean".to_owned());
         let mut lines = Vec::new();
-        for way in Way::ALL {
+        for rule in Rule::ALL {
             for head in &self.heads {
                 let means: Vec<Mean> = columns
                     .iter()
                     .flat_map(|questions| {
-                        let of = |score: fn(&Answer) -> Option<f64>| self.mean(head, way, questions, score);
+                        let of = |score: fn(&Answer) -> Option<f64>| self.mean(head, rule, questions, score);
                         [of(|answer| answer.macc), of(|answer| answer.miou)]
                     })
                     .collect();
                 if means.iter().any(|mean| mean.mean.is_some()) {
                     lines.push(Line {
                         title: title(head, &self.camera),
-                        way,
+                        rule,
                         cells: means.into_iter().map(|mean| (mean, false)).collect(),
-                        published: published(asked, head, way),
+                        published: published(asked, head, rule),
                     });
                 }
             }
@@ -203,12 +203,12 @@ impl Queries {
     fn mean(
         &self,
         head: &str,
-        way: Way,
+        rule: Rule,
         questions: &[(&str, &str)],
         score: fn(&Answer) -> Option<f64>,
     ) -> Mean {
         let of: Vec<&Answer> =
-            self.answers.iter().filter(|answer| answer.head == head && answer.by == way).collect();
+            self.answers.iter().filter(|answer| answer.head == head && answer.by == rule).collect();
         let seeds: BTreeSet<u64> = of.iter().map(|answer| answer.seed).collect();
         Mean::of(seeds.into_iter().map(|seed| {
             let answered: Option<Vec<Option<f64>>> = questions
@@ -225,14 +225,14 @@ impl Queries {
     }
 }
 
-/// Marks the largest number of every column among several lines of the same way. Equal as they are shown is equal.
+/// Marks the largest number of every column among several lines of the same rule. Equal as they are shown is equal.
 fn mark_best(lines: &mut [Line]) {
     let shown = |cell: &Cell| cell.0.mean.map(|mean| (mean * 10f64.powi(DIGITS as i32)).round());
-    for of_way in lines.chunk_by_mut(|a, b| a.way == b.way).filter(|lines| lines.len() > 1) {
-        for column in 0..of_way[0].cells.len() {
-            let most = of_way.iter().filter_map(|line| shown(&line.cells[column]));
+    for of_rule in lines.chunk_by_mut(|a, b| a.rule == b.rule).filter(|lines| lines.len() > 1) {
+        for column in 0..of_rule[0].cells.len() {
+            let most = of_rule.iter().filter_map(|line| shown(&line.cells[column]));
             let most = most.fold(f64::NEG_INFINITY, f64::max);
-            for line in &mut *of_way {
+            for line in &mut *of_rule {
                 line.cells[column].1 = shown(&line.cells[column]) == Some(most);
             }
         }
@@ -240,9 +240,9 @@ fn mark_best(lines: &mut [Line]) {
 }
 
 /// Published numbers of a head: those of the scene that a capture is called after, else their means. They were
-/// taken with a detector's help, so that they stand beside no answer by labels.
-fn published(asked: &[(&str, &[String])], head: &str, way: Way) -> String {
-    if way == Way::Labels {
+/// taken with a detector's help, so that they are not shown with answers by labels.
+fn published(asked: &[(&str, &[String])], head: &str, rule: Rule) -> String {
+    if rule == Rule::Labels {
         return "–".to_owned();
     }
     let words = |of: &PublishedAnswer| format!("{:.2} / {:.2}", of.macc, of.miou);

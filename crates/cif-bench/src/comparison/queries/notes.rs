@@ -1,7 +1,7 @@
 //! Remarks that readers of the answers need.
 
 use super::super::tables::missing_note;
-use super::{Queries, Way};
+use super::{Queries, Rule};
 
 impl Queries {
     /// Notes for readers of the tables.
@@ -37,9 +37,9 @@ impl Queries {
                     .to_owned(),
             );
         }
-        if self.answers.iter().any(|answer| answer.by == Way::Relevance) {
+        if self.answers.iter().any(|answer| answer.by == Rule::Relevance) {
             notes.push(
-                "relevance: 4D LangSplat tells no instances apart; a pixel is in its answer where the features that it \
+                "relevance: 4D LangSplat does not separate instances; a pixel is in its answer where the features that it \
                  learnt of maps that were given are relevant for the code of the question. It is its time-agnostic field \
                  alone, of one granularity, with relevance in the space of the codes, because no decoder is given."
                     .to_owned(),

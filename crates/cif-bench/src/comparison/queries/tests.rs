@@ -5,7 +5,7 @@ fn answer(
     head: &str,
     seed: u64,
     question: &str,
-    by: Way,
+    by: Rule,
     scores: Option<(f64, f64)>,
 ) -> Answer {
     Answer {
@@ -23,7 +23,7 @@ fn answer(
 }
 
 fn queries() -> Queries {
-    let (labels, models) = (Way::Labels, Way::Reproject);
+    let (labels, models) = (Rule::Labels, Rule::Reproject);
     Queries {
         questions: vec![
             ("americano".into(), vec!["mat".into(), "glass_cup".into()]),
@@ -49,8 +49,8 @@ fn means_are_over_questions_then_over_seeds_of_one_rule() {
     let tables = queries().tables();
     let captions: Vec<&str> = tables.iter().map(|table| &table.caption[..]).collect();
     assert_eq!(captions, ["americano", "table", "all questions of americano, table"]);
-    let lines: Vec<(&str, Way)> = tables[0].lines.iter().map(|line| (&line.title[..], line.way)).collect();
-    let expected = [("CIF", Way::Labels), ("SA4D (all cameras)", Way::Labels), ("CIF", Way::Reproject)];
+    let lines: Vec<(&str, Rule)> = tables[0].lines.iter().map(|line| (&line.title[..], line.rule)).collect();
+    let expected = [("CIF", Rule::Labels), ("SA4D (all cameras)", Rule::Labels), ("CIF", Rule::Reproject)];
     assert_eq!(lines, expected);
     let means = |table: usize, line: usize| -> Vec<Option<f64>> {
         tables[table].lines[line].cells.iter().map(|(mean, _)| mean.mean).collect()
@@ -79,7 +79,7 @@ fn the_best_are_marked_among_answers_by_the_same_rule() {
 #[test]
 fn published_numbers_stand_beside_answers_with_a_detector() {
     let mut queries = queries();
-    queries.answers.push(answer("table", "cif", 0, "red, \"round\" ball", Way::Grouping, Some((1.0, 1.0))));
+    queries.answers.push(answer("table", "cif", 0, "red, \"round\" ball", Rule::Grouping, Some((1.0, 1.0))));
     let tables = queries.tables();
     let published = |table: usize, line: usize| &tables[table].lines[line].published[..];
     assert_eq!(published(0, 0), "–");

@@ -15,7 +15,7 @@ impl Subject<'_> {
                 .to_owned(),
             format!(
                 "Published numbers ({}, {}, arXiv {}) were taken against other masks and cannot be compared with ours; \
-                 they tell the order of systems there. {}",
+                 they give the order of systems there. {}",
                 PUBLISHED.source.title, PUBLISHED.source.venue, PUBLISHED.source.arxiv, PUBLISHED.note
             ),
         ];
@@ -52,7 +52,7 @@ impl Subject<'_> {
 
 /// Runs that are not done yet, by capture and head.
 pub(in super::super) fn missing_note(missing: &[&Missing], camera: &str) -> Option<String> {
-    let mut told: Vec<String> = Vec::new();
+    let mut missing_runs: Vec<String> = Vec::new();
     for (k, first) in missing.iter().enumerate() {
         let same = |other: &&&Missing| (&other.capture, &other.head) == (&first.capture, &first.head);
         if missing[..k].iter().any(|earlier| same(&earlier)) {
@@ -61,9 +61,12 @@ pub(in super::super) fn missing_note(missing: &[&Missing], camera: &str) -> Opti
         let seeds: Vec<String> =
             missing.iter().filter(same).map(|missing| missing.seed.to_string()).collect();
         let name = title(&first.head, camera);
-        told.push(format!("{} with {name} (seed {})", first.capture, seeds.join(", ")));
+        missing_runs.push(format!("{} with {name} (seed {})", first.capture, seeds.join(", ")));
     }
-    (!told.is_empty()).then(|| {
-        format!("Not done yet, and not in the means: {}. The same command goes on.", told.join("; "))
+    (!missing_runs.is_empty()).then(|| {
+        format!(
+            "Missing, and not in the means: {}. Run the same command again for them.",
+            missing_runs.join("; ")
+        )
     })
 }

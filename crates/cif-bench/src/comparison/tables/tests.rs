@@ -100,9 +100,9 @@ fn what_is_missing_is_told_in_the_tables_that_lack_it() {
         |capture: &str, head: &str, seed| Missing { capture: capture.into(), head: head.into(), seed };
     let missing = [missing("a_b", "vlgs", 1), missing("a_b", "iii", 0), missing("a_b", "vlgs", 2)];
     let subject = Subject { rows: &rows, names: &names, camera: "", ablation: false, missing: &missing };
-    let told = "Not done yet, and not in the means: a_b with VLGS (re-implementation) (seed 1, 2).";
-    assert!(subject.markdown().contains(told), "{}", subject.markdown());
-    assert!(subject.latex().contains(told));
+    let note = "Missing, and not in the means: a_b with VLGS (re-implementation) (seed 1, 2).";
+    assert!(subject.markdown().contains(note), "{}", subject.markdown());
+    assert!(subject.latex().contains(note));
     let parts = ["iii".to_owned()];
     let of_parts = Subject { names: &parts, ablation: true, ..subject };
     assert!(of_parts.markdown().contains("a_b with (iii) no calibration (seed 0)"));

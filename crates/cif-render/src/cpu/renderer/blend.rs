@@ -18,7 +18,7 @@ use super::{CHUNK, NOT_VISIBLE, Renderer};
 use crate::constants::TILE;
 use crate::{BlendRequest, BlendedImage, Blending, GeometryPath, Gradients, RenderSettings};
 
-/// Inputs of gradients through blending weights, beside those of the values.
+/// Inputs of gradients through blending weights, in addition to those of the values.
 #[derive(Debug)]
 pub struct BlendWeightGradients<'a> {
     /// The field of the view.

@@ -42,7 +42,7 @@ fn scene(heads: Heads, gaussians: usize) -> SyntheticScene {
     scene
 }
 
-/// Tolerance-checked comparison of named arrays; tells the worst error.
+/// Tolerance-checked comparison of named arrays; prints the worst error.
 fn compare(name: &str, found: &[f64], expected: &[f64], tolerance: f64) {
     assert_eq!(found.len(), expected.len(), "{name}");
     let largest = expected.iter().fold(0.0_f64, |a, b| a.max(b.abs()));
@@ -311,7 +311,7 @@ fn several_chunks_are_as_one() {
 }
 
 #[test]
-fn gradients_that_are_not_finite_are_told() {
+fn gradients_that_are_not_finite_are_reported() {
     let Some(gpu) = testing::gpu() else { return };
     let scene = scene(SOME_HEADS, 40);
     let field = &scene.field;
@@ -337,7 +337,7 @@ fn gradients_that_are_not_finite_are_told() {
             &faults,
         );
         commands.submit();
-        let told = bit(&parameters::PLANES) | bit(&parameters::MEANS);
-        assert_eq!(faults.read(&gpu).unwrap()[0] & told, told, "{bad}");
+        let reported = bit(&parameters::PLANES) | bit(&parameters::MEANS);
+        assert_eq!(faults.read(&gpu).unwrap()[0] & reported, reported, "{bad}");
     }
 }

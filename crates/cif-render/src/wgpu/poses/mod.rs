@@ -151,7 +151,7 @@ pub struct GpuPoses {
     ranges: Vec<[u32; 2]>,
     /// Of all groups, one after the other.
     pub poses: GpuVec<Pose>,
-    /// By the poses, summed over the views of a step; beside the turn the views that the pose was a key of.
+    /// By the poses, summed over the views of a step; next to the turn the views that the pose was a key of.
     pub gradients: GpuVec<PoseSum>,
     /// The groups at the time of the view that was recorded last.
     pub views: GpuVec<GroupView>,

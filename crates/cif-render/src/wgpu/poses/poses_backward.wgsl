@@ -14,7 +14,7 @@
 // By the turn through the colour, see shared/torques.wgsl.
 @group(0) @binding(4) var<storage, read> torques: array<vec4f>;
 @group(0) @binding(5) var<storage, read_write> v_posed: array<vec4f>;
-// `[groups, GROUP_PARTS]`; beside the turn the Gaussians that have a gradient.
+// `[groups, GROUP_PARTS]`; next to the turn the Gaussians that have a gradient.
 @group(0) @binding(6) var<storage, read_write> parts: array<PoseSum>;
 
 const INVOCATIONS: u32 = 256u;

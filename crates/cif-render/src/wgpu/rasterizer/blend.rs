@@ -10,7 +10,7 @@ use crate::wgpu::kernel::{Commands, workgroups};
 use crate::wgpu::view::OCCUPANCY_NONE;
 use crate::{BlendRequest, Blending, GeometryPath};
 
-/// Inputs of gradients through blending weights, beside those of the values.
+/// Inputs of gradients through blending weights, in addition to those of the values.
 #[derive(Clone, Copy, Debug)]
 pub struct BlendWeightGradients<'a> {
     /// The Gaussians of the view.

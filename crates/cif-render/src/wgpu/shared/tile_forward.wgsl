@@ -1,7 +1,7 @@
 // Walks the splats of a tile front to back, for a workgroup with a pixel of each quadrant per invocation. The module says
-// how a `Pixel` starts, `pixel_of`, and where it goes, `write`; what is read beside the staged splats, `stage_more`; the
-// values of a splat that is drawn, `values_of`; and what they do to a pixel of a quadrant, `add`, for which `behind` is
-// the position after the splat in the list of the tile.
+// how a `Pixel` starts, `pixel_of`, and where it goes, `write`; what is read in addition to the staged splats,
+// `stage_more`; the values of a splat that is drawn, `values_of`; and what they do to a pixel of a quadrant, `add`, for
+// which `behind` is the position after the splat in the list of the tile.
 
 const BACKWARD: bool = false;
 #import tile_staging

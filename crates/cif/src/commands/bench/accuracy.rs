@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 use cif_bench::accuracy::ladders::{BASE, Base, NAMES, PAPER, Paper, QUICK_BASE};
 use cif_bench::accuracy::measure::{self, Training};
 use cif_bench::accuracy::record::Record;
-use cif_bench::accuracy::report::{self, Measured, Subject};
+use cif_bench::accuracy::report::{self, AccuracyReport, Measured, Subject};
 use cif_bench::accuracy::time_limit::{QUICK_SECONDS, TimeLimit};
-use cif_bench::accuracy::{Rung, Work, ladders};
+use cif_bench::accuracy::{Ladder, Rung, Work, ladders};
 use cif_bench::records::{Kept, Records};
 use cif_dataset::{Dataset, MadeFrom, Split};
 use cif_field::Field;
@@ -24,16 +24,18 @@ use cif_train::{Preset, Stop, SystemClock, TrainConfig, Trainer};
 use clap::Args;
 use serde_json::json;
 
+use crate::commands::shared::motion;
+use crate::commands::shared::named::preset;
 use crate::commands::shared::trajectories::Trajectories;
 use crate::commands::shared::{CaptureOptions, print_warnings};
-use crate::commands::{eval::motion, train};
 use crate::error::Error;
 use crate::lock::Lock;
 use crate::pictures::{Picture, instance_picture, rgb_picture};
+use crate::report::{JsonReport, Stored};
 use crate::settings::Layers;
 use crate::{interrupt, output, starting_points};
 
-/// Measure what accuracy costs in time and bytes, and write a report with plots
+/// Measure accuracy against time and bytes, and write a report with plots
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Ladders change one thing each and keep the rest: presets, iterations, resolution, gaussians,
@@ -45,24 +47,24 @@ settings have, as `cif train --effects all` does.
   cif bench accuracy captures/table -o report --ladders iterations,gaussians
   cif bench accuracy captures/table -o report --preset draft --set seed=3
 
-The ladder `paper` trains the preset `paper` beside the base, as published for the layout of the capture. That takes
+The ladder `paper` trains the preset `paper` in addition to the base, as published for the layout of the capture. That takes
 hours, so that it is measured only where it is named, with a quarter of its steps unless --paper-share says otherwise:
 the steps of all stages and everything that counts in steps are shortened alike, while batch, planes, network, losses,
-rates, Gaussians and images stay as published. What else there is no time for is reduced by --paper-set; the page tells
-both beside the numbers. A step has two or four views and no limit on Gaussians that acts: limiting these saves most.
+rates, Gaussians and images stay as published. --paper-set reduces other settings; the page lists
+both next to the numbers. A step has two or four views and no limit on Gaussians that acts: limiting these saves most.
 
   cif bench accuracy captures/table -o paper --ladders paper --paper-set densify.max_gaussians=20000
 
-The page also tells how the objects of the base move: a picture of their paths, and where the capture
+The page also shows how the objects of the base move: a picture of their paths, and where the capture
 has motion.json and tracks.npz, the scores of `cif eval` for every object.
 
 DIR holds report.html (needs no network), report.json, rungs.csv, the plots as SVG, and the rungs:
-finished ones are not measured again, and Ctrl-C keeps the one under way, so that the same command goes
-on where it stopped. --quick trains small scenes on reduced images and ends within five minutes: it shows
-how costs and scores move, not how good a scene can get. Rungs that do not fit are named; the same command
-once more goes on with them. Without --quick, a capture takes about thirty times a training run.
+finished ones are not measured again, and Ctrl-C keeps the current one, so that the same command
+continues where it stopped. --quick trains small scenes on reduced images and ends within five minutes: it shows
+how costs and scores change, not the best quality of a scene. Rungs that do not fit are listed; run the same command
+again for them. Without --quick, a capture takes about thirty times a training run.
 
-Processor time counts all threads together, so that other work on the machine disturbs it little.")]
+Processor time counts all threads together, so that other load on the machine changes it little.")]
 pub(super) struct BenchAccuracy {
     /// Folder of the capture
     capture: PathBuf,
@@ -161,21 +163,7 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
     }
     let mut config = base_config(command, dataset.layout)?;
     config.downscale = options.downscale;
-    let base = Base {
-        quick: command.quick,
-        steps: [config.stages.coarse, config.fine_iterations(), config.stages.instance],
-        until: [config.densify.until, config.resample.until],
-        gaussians: config.densify.max_gaussians,
-        points: config.model.max_initial_points,
-        nodes: config.model.spatial_resolution[0],
-        width: config.model.width,
-        sh_degree: config.model.sh_degree,
-        downscale: config.downscale.unwrap_or(1),
-        is_dynamic: dataset.times.len() > 1,
-        has_instances: dataset.frames.iter().any(|frame| frame.mask.is_some()),
-        instances_move_geometry: config.instance.geometry != InstanceGeometry::Off,
-        paper,
-    };
+    let base = base_of(command, &dataset, &config, paper);
     let mut all = ladders(&base);
     all.retain(|ladder| command.ladders.is_empty() || command.ladders.iter().any(|name| name == ladder.name));
     if all.is_empty() {
@@ -201,39 +189,7 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
         is_terminal: std::io::stderr().is_terminal(),
     };
     interrupt::watch();
-    let mut seen = BTreeSet::new();
-    let mut order: Vec<(&str, &Rung)> = all
-        .iter()
-        .flat_map(|ladder| ladder.rungs.iter().map(|rung| (ladder.name, rung)))
-        .filter(|(_, rung)| seen.insert(&rung.id))
-        .collect();
-    if command.quick {
-        // What costs least comes first, so that the time suffices for as many as can be.
-        order.sort_by_key(|(_, rung)| (rung.id != BASE, bench.expected_steps(rung)));
-    }
-    let mut limit = command.quick.then(|| TimeLimit::start(SystemClock::start(), QUICK_SECONDS));
-    let mut records: BTreeMap<String, Record> = BTreeMap::new();
-    let mut left_out = Vec::new();
-    let mut stopped = false;
-    for (number, (ladder, rung)) in order.iter().enumerate() {
-        let steps = bench.expected_steps(rung);
-        if bench.find(rung).good().is_none() && limit.as_ref().is_some_and(|limit| !limit.has_time_for(steps))
-        {
-            left_out.push(format!("{ladder}: {}", rung.label));
-            continue;
-        }
-        let begin_s = limit.as_ref().map_or(0.0, TimeLimit::elapsed_s);
-        let heading = format!("[{}/{}] {ladder}: {}", number + 1, order.len(), rung.label);
-        let Some(record) = bench.record(rung, &heading)? else {
-            stopped = true;
-            break;
-        };
-        if let Some(limit) = &mut limit {
-            limit.learn(steps, begin_s);
-        }
-        records.insert(rung.id.clone(), record);
-    }
-    drop(order);
+    let Rungs { records, left_out, stopped } = bench.measure_all(&all, command.quick)?;
     let measured: Measured = all
         .into_iter()
         .map(|ladder| {
@@ -250,19 +206,42 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
     let page = command.output.join("report.html");
     if stopped {
         return Err(Error::Interrupted {
-            message: format!("interrupted; {} holds what is measured so far", page.display()),
-            help: Some("the same command goes on".to_owned()),
+            message: format!("interrupted; {} holds the results so far", page.display()),
+            help: Some("run the same command again to continue".to_owned()),
         });
     }
     if !left_out.is_empty() {
         crate::messages::outcome!(
-            "left out, for they do not fit into five minutes: {}; the same command goes on with them",
+            "left out, because they do not fit into five minutes: {}; run the same command again for them",
             left_out.join("; ")
         );
     }
     crate::messages::outcome!("wrote {}", page.display());
-    let report = crate::report::read(&command.output.join("report.json"))?;
+    let report = Stored::<AccuracyReport<'static>>::read(&command.output.join("report.json"))?;
     command.report.give(|| report, || ())
+}
+
+/// Settings of the base that rungs multiply.
+fn base_of(command: &BenchAccuracy, dataset: &Dataset, config: &TrainConfig, paper: Option<Paper>) -> Base {
+    Base {
+        quick: command.quick,
+        steps: [config.stages.coarse, config.fine_iterations(), config.stages.instance],
+        until: [config.densify.until, config.resample.until],
+        gaussians: config.densify.max_gaussians,
+        points: config.model.max_initial_points,
+        nodes: config.model.spatial_resolution[0],
+        width: config.model.width,
+        sh_degree: config.model.sh_degree,
+        downscale: config.downscale.unwrap_or(1),
+        is_dynamic: dataset.times.len() > 1,
+        has_instances: dataset.frames.iter().any(|frame| frame.mask.is_some()),
+        instances_move_geometry: config.instance.geometry != InstanceGeometry::Off,
+        paper,
+    }
+}
+
+impl JsonReport for Stored<AccuracyReport<'static>> {
+    const COMMANDS: &'static [&'static str] = &["cif bench accuracy"];
 }
 
 /// Pixels that training images of a quick report have at the most.
@@ -282,7 +261,7 @@ fn reduction(dataset: &Dataset) -> Option<u32> {
 /// Settings that all ladders start from.
 fn base_config(command: &BenchAccuracy, layout: cif_dataset::Layout) -> Result<TrainConfig, Error> {
     let preset = match &command.preset {
-        Some(name) => train::preset(name, "--preset")?,
+        Some(name) => preset(name, "--preset")?,
         None if command.quick => Preset::Draft,
         None => Preset::Standard,
     };
@@ -305,7 +284,7 @@ fn of_preset(
     settings: &[String],
     layout: cif_dataset::Layout,
 ) -> Result<TrainConfig, Error> {
-    let config = TrainConfig::preset(train::preset(name, "ladders")?, layout);
+    let config = TrainConfig::preset(preset(name, "ladders")?, layout);
     let mut layers = Layers::new(if share < 1.0 { stretched(&config, share) } else { config });
     for assignment in settings {
         layers.assignment(assignment)?;
@@ -313,7 +292,17 @@ fn of_preset(
     layers.validated()
 }
 
-/// A report under way.
+/// Rungs that were measured.
+struct Rungs {
+    /// By id.
+    records: BTreeMap<String, Record>,
+    /// Names of those that there was no time for.
+    left_out: Vec<String>,
+    /// True where the user stopped it.
+    stopped: bool,
+}
+
+/// An unfinished report.
 struct Bench {
     capture: CaptureOptions,
     /// Inputs that all rungs are made from.
@@ -337,7 +326,7 @@ impl Bench {
         }
         match self.find(rung) {
             Kept::Good(record) => {
-                crate::messages::outcome!("{heading}: kept, {}", told(&record));
+                crate::messages::outcome!("{heading}: kept, {}", summary(&record));
                 return Ok(Some(record));
             }
             Kept::Void(why) => crate::messages::outcome!("{heading}: measured again: {why}"),
@@ -346,7 +335,7 @@ impl Bench {
         let Some(mut record) = self.measure(rung, heading)? else { return Ok(None) };
         record.fingerprint = self.fingerprint(rung);
         self.rungs.keep(&rung.id, &record)?;
-        self.show(&format!("{heading}: {}", told(&record)), true);
+        self.show(&format!("{heading}: {}", summary(&record)), true);
         Ok(Some(record))
     }
 
@@ -559,6 +548,44 @@ impl Bench {
         }
     }
 
+    /// Measures the rungs of all ladders, each once; in a quick report those that five minutes are enough for.
+    fn measure_all(&mut self, all: &[Ladder], quick: bool) -> Result<Rungs, Error> {
+        let mut seen = BTreeSet::new();
+        let mut order: Vec<(&str, &Rung)> = all
+            .iter()
+            .flat_map(|ladder| ladder.rungs.iter().map(|rung| (ladder.name, rung)))
+            .filter(|(_, rung)| seen.insert(&rung.id))
+            .collect();
+        if quick {
+            // What costs least comes first, so that the time suffices for as many as can be.
+            order.sort_by_key(|(_, rung)| (rung.id != BASE, self.expected_steps(rung)));
+        }
+        let mut limit = quick.then(|| TimeLimit::start(SystemClock::start(), QUICK_SECONDS));
+        let mut records: BTreeMap<String, Record> = BTreeMap::new();
+        let mut left_out = Vec::new();
+        let mut stopped = false;
+        for (number, (ladder, rung)) in order.iter().enumerate() {
+            let steps = self.expected_steps(rung);
+            if self.find(rung).good().is_none()
+                && limit.as_ref().is_some_and(|limit| !limit.has_time_for(steps))
+            {
+                left_out.push(format!("{ladder}: {}", rung.label));
+                continue;
+            }
+            let begin_s = limit.as_ref().map_or(0.0, TimeLimit::elapsed_s);
+            let heading = format!("[{}/{}] {ladder}: {}", number + 1, order.len(), rung.label);
+            let Some(record) = self.record(rung, &heading)? else {
+                stopped = true;
+                break;
+            };
+            if let Some(limit) = &mut limit {
+                limit.learn(steps, begin_s);
+            }
+            records.insert(rung.id.clone(), record);
+        }
+        Ok(Rungs { records, left_out, stopped })
+    }
+
     /// Motion of the objects of the base: scores where the capture knows it, and their paths in the shown frame.
     fn motion(&mut self) -> Result<Option<report::Motion>, Error> {
         let field = match self.base.take() {
@@ -613,7 +640,7 @@ fn draw(view: &FrameView<'_>) -> Vec<(&'static str, Picture)> {
 }
 
 /// A record in a line.
-fn told(record: &Record) -> String {
+fn summary(record: &Record) -> String {
     let mut parts = Vec::new();
     parts.push(if record.cpu_s >= 1.0 {
         format!("{:.1} s", record.cpu_s)

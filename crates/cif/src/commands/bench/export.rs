@@ -1,12 +1,13 @@
 //! `cif bench export`: what accuracy of motion costs in samples, bytes and time.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use cif_bench::export::{Rung, measure};
 use cif_scene::graph::ReportRow;
 use cif_scene::{SceneFormat, SceneOptions, Tolerance};
 use clap::Args;
+use serde::Serialize;
 
 use crate::commands::shared::model_options::ModelOptions;
 use crate::commands::shared::{motion_table, scene};
@@ -14,9 +15,9 @@ use crate::error::Error;
 use crate::formats::FORMATS;
 use crate::messages::note;
 use crate::output::Outputs;
-use crate::report::Report;
+use crate::report::{JsonReport, Report};
 
-/// Show what accuracy of motion costs
+/// Show the cost of accurate motion
 #[derive(Debug, Args)]
 #[command(after_help = "\
 The scene is built once per tolerance. Residuals are distances in world units: decisive is what the
@@ -24,7 +25,7 @@ tolerance is held against (worst time, without the outermost 5 % of an object's 
 motion that is fitted, and recorded poses, which leave as they are, have no residual. KB are the
 sampled values; write times and file sizes come with every format that this build can write, into a
 temporary folder. glTF holds few splats with paths of their own: what else is dense leaves as rigid parts there, and
-the lines of glTF tell what that misses (worst: largest decisive residual as a share of what is allowed).
+the lines of glTF show the residuals of that (worst: largest decisive residual as a share of what is allowed).
 
   cif bench export table.cif
   cif bench export table.cif --tolerances 0.5%,2% --motion parts
@@ -48,6 +49,19 @@ pub(super) struct BenchExport {
     force: bool,
 }
 
+/// Cost of the accuracy of motion.
+#[derive(Serialize)]
+struct ExportLadder<'a> {
+    /// The scene.
+    scene: &'a Path,
+    /// Every tolerance.
+    rungs: &'a [Rung],
+}
+
+impl JsonReport for ExportLadder<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif bench export"];
+}
+
 pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
     let mut outputs = Outputs::new(command.force);
     outputs.reads(&command.scene)?;
@@ -55,7 +69,7 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
     let field = scene::load(&command.scene)?;
     let folder = tempfile::tempdir()
         .map_err(|error| Error::plain(format!("cannot make a temporary folder: {error}")))?;
-    // A format that does not work is told once, and left out of all rungs.
+    // A format that does not work is reported once, and left out of all rungs.
     let moving = FORMATS.into_iter().filter(|format| format.about().most_expensive_motion.is_some());
     let mut formats: Vec<&dyn SceneFormat> = if command.no_files { Vec::new() } else { moving.collect() };
     let mut rungs = Vec::new();
@@ -83,7 +97,7 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
         });
         rungs.push(rung);
     }
-    let report = || serde_json::json!({ "scene": command.scene, "rungs": rungs });
+    let report = || ExportLadder { scene: &command.scene, rungs: &rungs };
     command.report.give(report, || print_ladder(&rungs))
 }
 
@@ -101,7 +115,7 @@ fn print_ladder(rungs: &[Rung]) {
     for rung in rungs {
         let others =
             rung.files.iter().filter_map(|file| Some((file.format, &file.simplified.as_ref()?.nodes)));
-        // Lines of a format that holds another motion tell only of the objects whose motion that is.
+        // Lines of a format that holds another motion are shown of the objects whose motion differs.
         let differs = |row: &&ReportRow| {
             !rung.nodes.iter().any(|here| here.name == row.name && here.motion == row.motion)
         };

@@ -1,18 +1,19 @@
-//! `cif bench hardness`: trains a capture that was changed in ways which must not matter or must not break.
+//! `cif bench hardness`: trains variants of a capture whose changes must not matter, or must not break a run.
 
 use std::path::{Path, PathBuf};
 
 use cif_bench::hard_captures::{HARD_CAPTURES, HardCapture, Unfit};
-use cif_bench::hardness::{self, MAX_MIOU_LOSS, MAX_PSNR_LOSS, Row, mean_of, number, signed};
+use cif_bench::hardness::{self, MAX_MIOU_LOSS, MAX_PSNR_LOSS, VariantScores, mean_of, number, signed};
 use cif_dataset::{Dataset, Layout};
 use cif_train::{Stop, TrainConfig};
 use clap::Args;
+use serde::Serialize;
 use serde_json::json;
 
+use crate::commands::shared::named::preset;
 use crate::commands::shared::{CaptureOptions, print_warnings};
-use crate::commands::train;
 use crate::error::Error;
-use crate::report::Report;
+use crate::report::{JsonReport, Report};
 use crate::settings::Layers;
 use crate::{interrupt, output};
 
@@ -24,7 +25,7 @@ const BASELINE_RUNS: u64 = 3;
 #[command(after_help = "\
 Every variant is trained with the same settings and seed, with all effects, as by --effects all of
 `cif train`, and scored on the same held-out frames. The capture itself is trained with three seeds;
-changes are told from their mean, beside the range that seeds alone make.
+changes are against their mean, and shown with the range between seeds.
 Scaling and moving the capture must not change PSNR by 0.3 dB or mIoU by 1 point; every variant must
 end with a finite scene. Exit code 1 when one does not.
 
@@ -32,7 +33,7 @@ end with a finite scene. Exit code 1 when one does not.
   cif bench hardness captures/table -o hardness --quick --only moved,wrong-camera
 
 The folder gets report.json and report.md. --quick trains half of the variants with a schedule of
-480 steps; without it the draft preset decides, unless --preset names another.")]
+480 steps; without it the preset draft is used, unless --preset names another.")]
 pub(super) struct BenchHardness {
     /// Folder of the capture
     capture: PathBuf,
@@ -98,12 +99,17 @@ pub(super) fn run(command: &BenchHardness) -> Result<(), Error> {
     interrupt::watch();
     let mut runs = Vec::new();
     for seed in (0..BASELINE_RUNS).map(|run| config.seed.wrapping_add(run)) {
-        let mut row = Row { name: "as it is", what: "the capture itself", verdict: "ok", ..Row::default() };
+        let mut row = VariantScores {
+            name: "as it is",
+            what: "the capture itself",
+            verdict: "ok",
+            ..VariantScores::default()
+        };
         measure(&mut row, &dataset, &TrainConfig { seed, ..config.clone() })?;
         if row.verdict == "failed" {
             return Err(Error::plain(format!("{}: {}", command.capture.display(), row.notes.join("; "))));
         }
-        tell(&row);
+        announce(&row);
         runs.push(row);
     }
     let baseline = mean_of(&runs);
@@ -112,7 +118,8 @@ pub(super) fn run(command: &BenchHardness) -> Result<(), Error> {
     for hard in chosen {
         let folder = tempfile::tempdir()
             .map_err(|error| Error::plain(format!("cannot make a temporary folder: {error}")))?;
-        let mut row = Row { name: hard.name, what: hard.what, verdict: "ok", ..Row::default() };
+        let mut row =
+            VariantScores { name: hard.name, what: hard.what, verdict: "ok", ..VariantScores::default() };
         match hard.of(&dataset, folder.path()) {
             Ok(changed) => {
                 row.notes.extend(changed.warnings.iter().cloned());
@@ -125,7 +132,7 @@ pub(super) fn run(command: &BenchHardness) -> Result<(), Error> {
             Err(Unfit::Failed(error)) => return Err(error.into()),
         }
         row.judge(&baseline, hard.demand);
-        tell(&row);
+        announce(&row);
         rows.push(row);
     }
     write_report(command, &config, &rows)?;
@@ -143,7 +150,7 @@ pub(super) fn run(command: &BenchHardness) -> Result<(), Error> {
 /// Settings of the preset, then what was typed.
 fn resolve(command: &BenchHardness, layout: Layout) -> Result<TrainConfig, Error> {
     let name = command.preset.as_deref().unwrap_or("draft");
-    let mut config = TrainConfig::preset(train::preset(name, "--preset")?, layout);
+    let mut config = TrainConfig::preset(preset(name, "--preset")?, layout);
     if command.quick {
         (config.stages.coarse, config.stages.fine, config.stages.instance) = (60, 300, 120);
         config.model.sh_interval = 60;
@@ -160,7 +167,7 @@ fn resolve(command: &BenchHardness, layout: Layout) -> Result<TrainConfig, Error
 }
 
 /// As [`hardness::measure`], until Ctrl-C.
-fn measure(row: &mut Row, dataset: &Dataset, config: &TrainConfig) -> Result<(), Error> {
+fn measure(row: &mut VariantScores, dataset: &Dataset, config: &TrainConfig) -> Result<(), Error> {
     hardness::measure(row, dataset, config, &Stop::when(interrupt::requested));
     if interrupt::requested() {
         return Err(Error::Interrupted {
@@ -171,7 +178,7 @@ fn measure(row: &mut Row, dataset: &Dataset, config: &TrainConfig) -> Result<(),
     Ok(())
 }
 
-fn tell(row: &Row) {
+fn announce(row: &VariantScores) {
     crate::messages::outcome!(
         "{:>18}  {:<8} PSNR {} {}  mIoU {} {}  {:.0} s",
         row.name,
@@ -184,7 +191,7 @@ fn tell(row: &Row) {
     );
 }
 
-fn write_report(command: &BenchHardness, config: &TrainConfig, rows: &[Row]) -> Result<(), Error> {
+fn write_report(command: &BenchHardness, config: &TrainConfig, rows: &[VariantScores]) -> Result<(), Error> {
     let mut table = crate::commands::shared::table([
         "variant",
         "verdict",
@@ -223,15 +230,41 @@ fn write_report(command: &BenchHardness, config: &TrainConfig, rows: &[Row]) -> 
         rows.iter().flat_map(|row| row.notes.iter().map(move |note| format!("- {}: {note}\n", row.name)));
     text += "\n";
     text.extend(notes);
-    let report = json!({
-        "capture": command.capture,
-        "limits": { "psnr_db": MAX_PSNR_LOSS, "miou_percent": MAX_MIOU_LOSS },
-        "config": config,
-        "variants": rows,
-    });
-    write(&command.output.join("report.json"), &format!("{report:#}\n"))?;
+    let report = HardnessReport {
+        capture: &command.capture,
+        limits: Limits { psnr_db: MAX_PSNR_LOSS, miou_percent: MAX_MIOU_LOSS },
+        config,
+        variants: rows,
+    };
+    write(&command.output.join("report.json"), &format!("{:#}\n", json!(report)))?;
     write(&command.output.join("report.md"), &text)?;
     command.report.give(|| report, || println!("{table}"))
+}
+
+/// Variants of a capture, trained and scored.
+#[derive(Serialize)]
+struct HardnessReport<'a> {
+    /// The capture.
+    capture: &'a Path,
+    /// Largest changes that a variant may make which must not matter.
+    limits: Limits,
+    /// Settings of all runs, see [settings](settings.md).
+    config: &'a TrainConfig,
+    /// The capture itself, then every variant.
+    variants: &'a [VariantScores],
+}
+
+/// Largest changes.
+#[derive(Serialize)]
+struct Limits {
+    /// Change of PSNR, dB.
+    psnr_db: f64,
+    /// Change of mIoU, percentage points.
+    miou_percent: f64,
+}
+
+impl JsonReport for HardnessReport<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif bench hardness"];
 }
 
 fn write(path: &Path, text: &str) -> Result<(), Error> {

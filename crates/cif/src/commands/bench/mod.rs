@@ -6,11 +6,12 @@ mod compare;
 mod export;
 mod hardness;
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Duration;
 
 #[cfg(feature = "wgpu")]
-use cif_bench::device::{OnDevice, StageTimes};
+use cif_bench::device::{DeviceReport, OnDevice, StageTimes};
 use cif_dataset::{Dataset, Layout};
 use cif_field::Field;
 use cif_geometry::stats::{median, median_of_sorted};
@@ -21,17 +22,19 @@ use cif_train::metrics::training_config;
 use cif_train::wgpu::floors::StepShape;
 use cif_train::{InstancePass, Stage, StepTimes, Stop, TrainConfig, Trainer};
 use clap::{Args, Subcommand, ValueEnum};
-use serde_json::{Map, Value, json};
+use serde::Serialize;
 
-use super::{Simd, shared::scene, train};
+use super::shared::named::preset;
+use super::shared::scene;
+use super::shared::simd::Simd;
 use crate::commands::shared::{CaptureOptions, print_warnings};
 use crate::error::Error;
 use crate::output::Outputs;
-use crate::report::Report as JsonReport;
+use crate::report::{JsonReport, Report as ReportOption};
 use crate::settings::Layers;
 use crate::{interrupt, starting_points};
 
-/// Measure what a training step, an export or accuracy costs, how hard captures fare and how the method compares
+/// Measure training steps, exports, accuracy against cost, hard captures, and other methods
 #[derive(Debug, Args)]
 #[command(subcommand_required = true, arg_required_else_help = true)]
 pub(super) struct Bench {
@@ -53,17 +56,17 @@ enum What {
 #[command(after_help = "\
 Times are milliseconds per step, mean and median over the measured steps; shares are of the mean.
 Without --scene the Gaussians are the capture's points, with few of the properties of a trained
-scene: give a scene to measure what training costs in the end.
+scene: give a scene to measure the cost of late training steps.
 
   cif bench step captures/table --preset draft
   cif bench step captures/table --scene table.cif --threads 1 --json cost.json
   cif bench step captures/table --scene table.cif --instances 8,256
 
-In the instance stage every view is measured twice, with the instance pass and without, which tells
+In the instance stage every view is measured twice, with the instance pass and without, which gives
 what the pass adds to colour. --instances repeats that from the same start with a longer table of
-instances, the labels spread over it. Nothing is saved of the training done.
+instances, with the labels spread over it. The trained steps are not saved.
 
-On a GPU (--backend wgpu) every stage is also timed there, beside its floor: the bytes that it has to
+On a GPU (--backend wgpu) every stage is also timed there, next to its floor: the bytes that it has to
 move and the operations that it has to do at the least, at the speeds that a copy and a loop of
 multiplications and additions reach on the same device. The same steps are then done on the processor.")]
 struct Step {
@@ -85,7 +88,7 @@ struct Step {
     #[arg(long, value_name = "K,...", value_delimiter = ',', value_parser = clap::value_parser!(u16).range(1..=60_000))]
     instances: Vec<u16>,
     #[command(flatten)]
-    report: JsonReport,
+    report: ReportOption,
     /// Replace existing output
     #[arg(long)]
     force: bool,
@@ -166,7 +169,7 @@ fn step(command: &Step) -> Result<(), Error> {
     }
     print_warnings(&dataset);
     let report = measure(command, &dataset, &config, field, stage)?;
-    command.report.give(|| report.json(), || report.print())
+    command.report.give(|| report.report(), || report.print())
 }
 
 fn no_instances() -> Error {
@@ -179,7 +182,7 @@ fn no_instances() -> Error {
 /// Settings of the scene or the preset, then what was typed.
 fn resolve(command: &Step, field: Option<&Field>, layout: Layout) -> Result<TrainConfig, Error> {
     let base = match (&command.preset, field.and_then(training_config)) {
-        (Some(name), _) => TrainConfig::preset(train::preset(name, "--preset")?, layout),
+        (Some(name), _) => TrainConfig::preset(preset(name, "--preset")?, layout),
         (None, Some(trained)) => trained,
         (None, None) => TrainConfig::preset(Default::default(), layout),
     };
@@ -252,7 +255,7 @@ fn measure(
     })
 }
 
-/// Stages on the device beside their floors, and the same steps on the processor.
+/// Stages on the device next to their floors, and the same steps on the processor.
 #[cfg(feature = "wgpu")]
 fn beside_processor(
     command: &Step,
@@ -396,6 +399,81 @@ struct Unit {
     ns_each: Option<f64>,
 }
 
+/// Cost of the parts of a training step.
+#[derive(Serialize)]
+struct StepReport<'a> {
+    /// Stage of the training.
+    stage: Stage,
+    /// Steps that were measured.
+    steps: usize,
+    /// Steps before them that were not.
+    warm_up: u32,
+    /// Threads.
+    threads: usize,
+    /// Vector instructions.
+    simd: &'a str,
+    /// Instances.
+    instances: usize,
+    /// Parts of a step on the processor, by name, and `total`.
+    stages: BTreeMap<&'static str, PartReport>,
+    /// Counts of the work of a step, by name.
+    units: BTreeMap<&'static str, UnitReport>,
+    /// Pairs of a pixel and a Gaussian that a thread evaluates in the forward raster pass, per second.
+    evaluated_pairs_per_second_and_thread: Option<f64>,
+    /// Cost of the instance pass on top of colour, for every number of instances; empty in other stages.
+    instance_pass: Vec<PassReport>,
+    /// The same steps on a GPU; null without one.
+    #[cfg(feature = "wgpu")]
+    device: Option<DeviceReport<'a>>,
+    #[cfg(not(feature = "wgpu"))]
+    device: Option<()>,
+}
+
+/// Wall time of a part of a step.
+#[derive(Serialize)]
+struct PartReport {
+    /// Mean, milliseconds.
+    mean_ms: f64,
+    /// Median, milliseconds.
+    median_ms: f64,
+    /// Share of the mean of the whole step, in [0, 1].
+    share: Option<f64>,
+}
+
+/// A count of the work of a step.
+#[derive(Serialize)]
+struct UnitReport {
+    /// Mean count of a step.
+    per_step: f64,
+    /// Part of the step whose time it is related to.
+    of: &'static str,
+    /// Time of that part over the count, nanoseconds.
+    ns_each: Option<f64>,
+}
+
+/// Median cost of the instance pass, of views that were measured with and without it in turns.
+#[derive(Serialize)]
+struct PassReport {
+    /// Instances.
+    instances: usize,
+    /// Raster forward and backward without the pass, milliseconds.
+    raster_ms_without: f64,
+    /// The same with it, milliseconds.
+    raster_ms: f64,
+    /// Median of the growth, percent.
+    raster_overhead_percent: Option<f64>,
+    /// Whole step without the pass, milliseconds.
+    total_ms_without: f64,
+    /// The same with it, milliseconds.
+    total_ms: f64,
+    /// Median of the growth, percent.
+    total_overhead_percent: Option<f64>,
+}
+
+impl JsonReport for StepReport<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif bench step"];
+}
+
 impl Report {
     fn steps(&self) -> &[StepTimes] {
         &self.series[0].steps
@@ -444,58 +522,44 @@ impl Report {
         (seconds > 0.0).then(|| pairs as f64 / seconds / rayon::current_num_threads() as f64)
     }
 
-    fn json(&self) -> Value {
+    fn report(&self) -> StepReport<'_> {
         let costs = self.costs();
         let whole = costs.last().map_or(0.0, |(_, cost)| cost.mean);
-        let stages: Map<String, Value> = costs
-            .iter()
-            .map(|(name, cost)| {
-                let share = if whole > 0.0 { Some(cost.mean / whole) } else { None };
-                let value = json!({ "mean_ms": cost.mean, "median_ms": cost.median, "share": share });
-                ((*name).to_owned(), value)
+        let part = |(name, cost): &(&'static str, Cost)| {
+            let share = (whole > 0.0).then(|| cost.mean / whole);
+            (*name, PartReport { mean_ms: cost.mean, median_ms: cost.median, share })
+        };
+        let unit = |unit: Unit| {
+            (unit.name, UnitReport { per_step: unit.per_step, of: unit.stage, ns_each: unit.ns_each })
+        };
+        let pass = |series: &Series| {
+            let Overhead { raster, total } = series.overhead()?;
+            Some(PassReport {
+                instances: series.instances,
+                raster_ms_without: raster.without,
+                raster_ms: raster.with,
+                raster_overhead_percent: raster.percent,
+                total_ms_without: total.without,
+                total_ms: total.with,
+                total_overhead_percent: total.percent,
             })
-            .collect();
-        let units: Map<String, Value> = self
-            .units()
-            .into_iter()
-            .map(|unit| {
-                let value = json!({ "per_step": unit.per_step, "of": unit.stage, "ns_each": unit.ns_each });
-                (unit.name.to_owned(), value)
-            })
-            .collect();
-        let passes: Vec<Value> = self
-            .series
-            .iter()
-            .filter_map(|series| {
-                let Overhead { raster, total } = series.overhead()?;
-                Some(json!({
-                    "instances": series.instances,
-                    "raster_ms_without": raster.without,
-                    "raster_ms": raster.with,
-                    "raster_overhead_percent": raster.percent,
-                    "total_ms_without": total.without,
-                    "total_ms": total.with,
-                    "total_overhead_percent": total.percent,
-                }))
-            })
-            .collect();
-        #[cfg(feature = "wgpu")]
-        let device = self.device.as_ref().map(OnDevice::json);
-        #[cfg(not(feature = "wgpu"))]
-        let device = Value::Null;
-        json!({
-            "stage": self.stage,
-            "steps": self.steps().len(),
-            "warm_up": self.warm_up,
-            "threads": rayon::current_num_threads(),
-            "simd": self.simd,
-            "instances": self.series[0].instances,
-            "stages": stages,
-            "units": units,
-            "evaluated_pairs_per_second_and_thread": self.pair_rate(),
-            "instance_pass": passes,
-            "device": device,
-        })
+        };
+        StepReport {
+            stage: self.stage,
+            steps: self.steps().len(),
+            warm_up: self.warm_up,
+            threads: rayon::current_num_threads(),
+            simd: &self.simd,
+            instances: self.series[0].instances,
+            stages: costs.iter().map(part).collect(),
+            units: self.units().into_iter().map(unit).collect(),
+            evaluated_pairs_per_second_and_thread: self.pair_rate(),
+            instance_pass: self.series.iter().filter_map(pass).collect(),
+            #[cfg(feature = "wgpu")]
+            device: self.device.as_ref().map(OnDevice::report),
+            #[cfg(not(feature = "wgpu"))]
+            device: None::<()>,
+        }
     }
 
     fn print(&self) {

@@ -2,6 +2,7 @@
 
 mod as_json;
 mod options;
+mod posed;
 mod report;
 mod scale;
 mod shown;
@@ -15,18 +16,16 @@ use cif_capture::import::{self, Imported};
 use cif_capture::masks::{self, Masks};
 use cif_capture::poses::{Point, Poses};
 use cif_capture::source::sources;
-use cif_capture::structure::{self, Found, Lenses, Order, Request, Verdict};
+use cif_capture::structure::{self, Found, Lenses, Request};
 use cif_capture::write::{self, Capture as Written};
 use cif_capture::{Hooks, Progress, times};
 
 pub(super) use self::options::Capture;
-use self::options::{LensesName, OrderName};
+use self::options::LensesName;
+use self::posed::{Left, Posed, is_fixed, order};
 use self::shown::Shown;
 use crate::error::Error;
 use crate::interrupt;
-
-/// Photographs are matched each with each up to this number, unless something else is asked for.
-const ANY_ORDER: usize = 120;
 
 impl From<cif_capture::Error> for Error {
     fn from(error: cif_capture::Error) -> Self {
@@ -34,20 +33,11 @@ impl From<cif_capture::Error> for Error {
             cif_capture::Error::Stopped => {
                 Self::Interrupted { message: "interrupted".to_owned(), help: None }
             }
-            cif_capture::Error::Refused { problem, fix }
-            | cif_capture::Error::StandsStill { problem, fix } => Self::failed(problem, fix),
+            cif_capture::Error::System(error @ cif_system::Error::Refused { .. }) => error.into(),
+            cif_capture::Error::StandsStill { problem, fix } => Self::failed(problem, fix),
             other => Self::plain(other),
         }
     }
-}
-
-/// Poses of all images, and how they came about.
-struct Posed {
-    poses: Poses,
-    from: String,
-    verdict: Option<Verdict>,
-    metres_known: bool,
-    up_known: bool,
 }
 
 pub(super) fn run(command: &Capture) -> Result<(), Error> {
@@ -96,15 +86,6 @@ struct Places<'a> {
     /// Folder for features and matches, which a run without a capture leaves to the next.
     kept: &'a Path,
     shown: &'a Shown,
-}
-
-/// What a run without a capture leaves to those that go on from it.
-#[derive(Default)]
-struct Left {
-    /// Poses that were found and not believed.
-    unbelieved: Option<Posed>,
-    /// A camera was seen to stand still, which no other option changes than one that says that it moves.
-    stands_still: bool,
 }
 
 /// Finds or reads the poses of images and writes the capture; fills `left` where it cannot.
@@ -228,7 +209,7 @@ fn find(
     })
 }
 
-/// Points for poses that come without. Where none can be found, training starts from random ones, which is told.
+/// Points for poses that come without. Where none can be found, training starts from random ones, with a warning.
 fn points(
     command: &Capture,
     shots: &[Shot],
@@ -305,22 +286,6 @@ fn request<'a>(
     }
 }
 
-/// True where the cameras stand still, as told or seen.
-fn is_fixed(command: &Capture, shots: &[Shot]) -> bool {
-    command.fixed || (!command.moving && frames::is_fixed(shots))
-}
-
-/// How images that are solved follow each other.
-fn order(command: &Capture, solved: &[Shot], fixed: bool) -> Order {
-    let is_video = solved.iter().any(|shot| shot.time.is_some()) && command.times.is_none();
-    match command.order {
-        OrderName::Sequence => Order::Sequence,
-        OrderName::Any => Order::Any,
-        OrderName::Auto if fixed || (!is_video && solved.len() <= ANY_ORDER) => Order::Any,
-        OrderName::Auto => Order::Sequence,
-    }
-}
-
 /// Every frame of a fixed camera has the pose of the one that was solved.
 fn all_frames(poses: &Poses, solved: &[Shot], shots: &[Shot]) -> BTreeMap<String, cif_capture::poses::Pose> {
     let of_camera: BTreeMap<&str, _> = solved
@@ -329,9 +294,4 @@ fn all_frames(poses: &Poses, solved: &[Shot], shots: &[Shot]) -> BTreeMap<String
         .collect();
     let pose = |shot: &Shot| Some((shot.name.clone(), *of_camera.get(shot.camera.as_str())?));
     shots.iter().filter_map(pose).collect()
-}
-
-/// File in which a scene of this capture would be saved, for messages.
-fn scene_name(place: &Path) -> PathBuf {
-    place.with_extension("cif")
 }

@@ -21,19 +21,18 @@ on the PATH; poses need pycolmap, which `pip install 'cif4d[capture]'` brings.
   cif capture walk.mp4 -o captures/table --masks masks --length 'red mug' 0.09
   cif capture photos/ -o captures/garden --poses colmap/sparse/0
 
-Poses are found by COLMAP's global mapper; where few points hold the images or matches do not fit, the incremental one is
-run too, and again with more features where these disagree. The verdict looks at the share of images with a pose, the
-reprojection error, the focal length and how far two runs are apart; where it says no, no capture is written (--accept
-writes it all the same), but frames of videos and the poses are kept in DIR-unfinished, and the commands that go on from
-there are shown. Features and matches are kept in DIR-features until a capture is written, also after Ctrl-C: a next try
-with the same DIR, of the same or some of the same images, goes on from them. Poses from images know neither metre nor up: up is taken from how
-the cameras were held, the metre from --length or --measured, and the capture tells what is known.
+Poses are found by COLMAP's global mapper; where images have few points or matches do not fit, the incremental mapper is
+run too, and again with more features where the two disagree. The poses are then checked: share of images with a pose,
+reprojection error, focal length, and the difference between two runs. If the check fails, no capture is written (--accept
+writes it anyway); frames of videos and the poses are kept in DIR-unfinished, and the commands that continue from
+there are printed. Features and matches are kept in DIR-features until a capture is written, also after Ctrl-C: another
+run with the same DIR, on the same images or some of them, continues from them. Images alone fix neither scale nor up: up
+is taken from how the cameras were held, the metre from --length or --measured, and the report says which of them are known.
 
-Cameras of a rig that stand still are told by their pictures; they are solved at one moment, and give the points of four.
-Frames of a video are called by their number in the stream (000123.png), and the capture remembers the video, so that
-masks of all its frames, at its size, fit the frames that were taken. HLG and PQ video, as phones record it, becomes the
-display values of sRGB. Photographs become upright, as their EXIF says; poses and masks of their pixels as they are stored
-turn with them. Times are those of the stream, or of a table: one line per image with its name, a comma, and seconds.")]
+Cameras of a rig that stand still are recognised by their images; they are solved at one moment, and triangulate points at four.
+Frames of a video are named by their number in the stream (000123.png), and the capture records the video, so that
+masks of all its frames, at its size, match the frames that were taken. HLG and PQ video, as phones record it, is converted
+to sRGB. Photographs are turned upright, as their EXIF says; poses and masks of the stored pixels are turned with them. Times are those of the stream, or of a table: one line per image with its name, a comma, and seconds.")]
 pub(in crate::commands) struct Capture {
     /// Videos and folders of photographs, one per camera
     #[arg(required = true, value_name = "INPUT")]
@@ -89,14 +88,14 @@ pub(in crate::commands) struct Capture {
     /// The cameras stand still: one moment gives their poses
     #[arg(long, conflicts_with = "moving", help_heading = "Poses")]
     pub(super) fixed: bool,
-    /// The cameras move, though most of their pictures stays as it is
+    /// The cameras move, although most of their image stays the same
     #[arg(long, help_heading = "Poses")]
     pub(super) moving: bool,
     /// Take poses of another tool: a COLMAP model, a nerfstudio transforms.json, a Polycam export, a
     /// RealityCapture registration (.csv), or cameras of Metashape (.xml); where it has no points, pycolmap finds them
     #[arg(long, value_name = "FROM", conflicts_with_all = ["focal", "fixed", "moving"], help_heading = "Poses")]
     pub(super) poses: Option<PathBuf>,
-    /// Write the capture even where the verdict says no
+    /// Write the capture even if the poses fail their check
     #[arg(long, help_heading = "Poses")]
     pub(super) accept: bool,
     /// Longest side of an object of the masks that stands still, by its label or id, in metres
@@ -118,7 +117,7 @@ pub(in crate::commands) struct Capture {
     pub(super) quiet: bool,
     #[command(flatten)]
     pub(super) report: crate::report::OnlyReport,
-    /// A step of `cif make`, which tells what comes next
+    /// A step of `cif make`, which prints the next step itself
     #[arg(long, hide = true)]
     pub(super) step: bool,
 }

@@ -6,7 +6,8 @@ use cif_capture::frames::Shot;
 use cif_capture::masks::Masks;
 use cif_capture::structure::Verdict;
 
-use super::{Capture, Posed, scene_name};
+use super::options::Capture;
+use super::posed::{Posed, scene_name};
 use crate::commands::shared::command_line;
 use crate::error::Error;
 

@@ -10,8 +10,8 @@ use cif_capture::{Hooks, known_length};
 use cif_dataset::meant::known_names;
 use glam::{DVec2, DVec3};
 
-use super::options::{UpName, positive};
-use super::{Capture, Posed};
+use super::options::{Capture, UpName, positive};
+use super::posed::Posed;
 use crate::error::Error;
 
 /// A length of the scene that is known.
@@ -39,7 +39,7 @@ impl Known {
     }
 }
 
-/// Turns and scales the world, and tells in two sentences what is known of it.
+/// Turns and scales the world, and describes in two sentences how.
 pub(super) fn settle(
     command: &Capture,
     known: &Known,
@@ -85,10 +85,10 @@ fn up(command: &Capture, posed: &mut Posed) -> String {
             Some(direction) => {
                 posed.poses.transform(&world::upright(direction));
                 posed.up_known = true;
-                "+z is up, by how the cameras were held (--up tells otherwise)".to_owned()
+                "+z is up, by how the cameras were held (--up sets another direction)".to_owned()
             }
             None => "up is not known: the cameras were held every way; gravity of exported physics would be wrong \
-                     (--up X,Y,Z tells)"
+                     (--up X,Y,Z sets it)"
                 .to_owned(),
         },
         UpName::Unknown => {

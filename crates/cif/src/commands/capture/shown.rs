@@ -17,7 +17,7 @@ pub(super) struct Shown {
     phase: Mutex<Phase>,
 }
 
-/// What was shown last.
+/// Text that was shown last.
 struct Phase {
     words: String,
     line: Instant,

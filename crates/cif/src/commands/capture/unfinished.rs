@@ -7,8 +7,8 @@ use cif_capture::source::Source;
 use cif_capture::structure::{self, Order};
 use cif_capture::unfinished::{Unfinished, keep as keep_unfinished};
 
-use super::options::{LensesName, OrderName, UpName};
-use super::{Capture, Left};
+use super::options::{Capture, LensesName, OrderName, UpName};
+use super::posed::{self, Left};
 use crate::commands::shared::command_line;
 use crate::error::Error;
 
@@ -35,7 +35,7 @@ pub(super) fn keep(command: &Capture, sources: &[Source], shots: &[Shot], left: 
         structure::remove_kept(&features);
     } else {
         eprintln!(
-            "kept: {} has the features and matches found; a next try with -o {} goes on from them",
+            "kept: {} has the features and matches; another run with -o {} continues from them",
             features.display(),
             command.output.display()
         );
@@ -45,8 +45,8 @@ pub(super) fn keep(command: &Capture, sources: &[Source], shots: &[Shot], left: 
         None if has_features => command.inputs.clone(),
         None => return,
     };
-    let fixed = super::is_fixed(command, shots);
-    let order = super::order(command, shots, fixed);
+    let fixed = posed::is_fixed(command, shots);
+    let order = posed::order(command, shots, fixed);
     let times = kept.as_ref().and_then(|kept| kept.times.as_deref());
     let mut again = again(command, &inputs, times, order);
     if kept.is_none() {

@@ -1,6 +1,6 @@
-//! `cif export --check`: written files read back, and drawn beside the scene that they came from.
+//! `cif export --check`: written files, read back and compared with the scene that they came from.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use cif_dataset::{Dataset, Split};
@@ -9,15 +9,16 @@ use cif_render::cpu::SimdLevel;
 use cif_scene::motion::loose::LOOSE_SPLATS;
 use cif_scene::{ExportOptions, ReadOptions, SceneGraph, time_in_field};
 use cif_train::metrics::Scores;
-use cif_train::metrics::round_trip::{HeldOutLoss, Likeness, SharedView, held_out_loss, likeness};
+use cif_train::metrics::round_trip::{
+    HeldOutLoss, Likeness, ObjectLikeness, ObjectLoss, SharedView, held_out_loss, likeness,
+};
 use clap::Args;
-use serde_json::{Value, json};
+use serde::Serialize;
 
 use super::preset::Preferred;
 use super::targets::{Target, Targets, Writing};
-use crate::commands::eval::number;
-use crate::commands::query::code_at;
-use crate::commands::shared::scene;
+use crate::commands::shared::scene::{self, code_at};
+use crate::commands::shared::table::number;
 use crate::commands::shared::{CaptureOptions, print_misfits, print_warnings};
 use crate::error::Error;
 use crate::output::Outputs;
@@ -30,7 +31,7 @@ const MUCH_DB: f64 = 0.2;
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Check")]
 pub(super) struct Check {
-    /// Read every file back as `cif import` does, draw it beside the scene, and tell what was lost
+    /// Read every file back as `cif import` does, render it next to the scene, and report the loss
     #[arg(long)]
     pub(super) check: bool,
     /// Views of the scene's own cameras that are compared, spread over its times
@@ -69,6 +70,103 @@ pub(super) struct Finding {
     likeness: Option<Likeness>,
     /// `None` where none was asked for, inside where no image shows a time that the file holds.
     held_out: Option<Option<HeldOutLoss>>,
+}
+
+/// A file that was read back.
+#[derive(Debug, Serialize)]
+pub(super) struct FileCheck<'a> {
+    /// The file.
+    file: &'a Path,
+    /// Name of its format.
+    format: &'static str,
+    /// Time code that it holds, where that is one moment only; null otherwise.
+    time_code: Option<f64>,
+    /// Wall time of reading the file, seconds.
+    read_s: f64,
+    /// Wall time of reading and comparing, seconds.
+    seconds: f64,
+    /// Views of the scene against the same views of the file; null where no camera of the scene sees a time of the
+    /// file.
+    against_scene: Option<LikenessReport>,
+    /// Loss against held-out images of a capture; null where none was named, or none shows a time of the file.
+    held_out: Option<HeldOutReport>,
+}
+
+/// Views of a scene against the same views of a file.
+#[derive(Debug, Serialize)]
+struct LikenessReport {
+    /// Views.
+    views: usize,
+    /// PSNR, dB; null where no pixel differs.
+    psnr: Option<f64>,
+    /// Mean intersection over union of the labels, percent.
+    miou: Option<f64>,
+    /// The same of every object.
+    objects: Vec<LikenessObject>,
+}
+
+/// An object in views of a scene and of a file.
+#[derive(Debug, Serialize)]
+struct LikenessObject {
+    /// Mask id.
+    id: u16,
+    /// Label.
+    label: String,
+    /// PSNR over its pixels, dB; null where none differs.
+    psnr: Option<f64>,
+    /// Intersection over union of its labels, percent.
+    iou: Option<f64>,
+}
+
+/// Scores of a scene and of a file on held-out images. Losses are positive where the file is worse.
+#[derive(Debug, Serialize)]
+struct HeldOutReport {
+    /// Images.
+    frames: usize,
+    /// Scores of the scene.
+    scene: ImageScores,
+    /// Scores of the file.
+    file: ImageScores,
+    /// Loss of PSNR, dB.
+    psnr_lost: Option<f64>,
+    /// Loss of mIoU, percentage points.
+    miou_lost: Option<f64>,
+    /// The same of every object.
+    objects: Vec<HeldOutObject>,
+}
+
+/// Scores on held-out images.
+#[derive(Debug, Serialize)]
+struct ImageScores {
+    /// Mean PSNR, dB.
+    psnr: Option<f64>,
+    /// Mean SSIM.
+    ssim: Option<f64>,
+    /// mIoU over labelled pixels, percent.
+    miou: Option<f64>,
+}
+
+/// Scores of an object: of the scene, then of the file.
+#[derive(Debug, Serialize)]
+struct HeldOutObject {
+    /// Mask id.
+    id: u16,
+    /// Label.
+    label: String,
+    /// PSNR over its pixels, dB.
+    psnr: [Option<f64>; 2],
+    /// Loss of PSNR, dB.
+    psnr_lost: Option<f64>,
+    /// Intersection over union, percent.
+    iou: [Option<f64>; 2],
+    /// Loss of it, percentage points.
+    iou_lost: Option<f64>,
+}
+
+impl ImageScores {
+    fn of(scores: &Scores) -> Self {
+        Self { psnr: scores.psnr, ssim: scores.ssim, miou: scores.instance.miou }
+    }
 }
 
 impl Check {
@@ -282,49 +380,50 @@ impl Clock<'_> {
 }
 
 impl Finding {
-    /// The finding as JSON; losses are positive where the file is worse.
-    pub(super) fn json(&self, field: &Field) -> Value {
-        let scores = |scores: &Scores| json!({ "psnr": scores.psnr, "ssim": scores.ssim, "miou": scores.instance.miou });
+    /// The finding for programs.
+    pub(super) fn report(&self, field: &Field) -> FileCheck<'_> {
         let held_out = self.held_out.iter().flatten().next().map(|found| {
             let (before, after) = (&found.field, &found.copy);
-            let objects: Vec<Value> = found
-                .objects
-                .iter()
-                .map(|object| {
-                    json!({
-                        "id": object.id,
-                        "label": label(field, object.id),
-                        "psnr": object.psnr,
-                        "psnr_lost": lost(object.psnr),
-                        "iou": object.iou,
-                        "iou_lost": lost(object.iou),
-                    })
-                })
-                .collect();
-            json!({
-                "frames": before.frames,
-                "scene": scores(before),
-                "file": scores(after),
-                "psnr_lost": lost([before.psnr, after.psnr]),
-                "miou_lost": lost([before.instance.miou, after.instance.miou]),
-                "objects": objects,
-            })
+            let object = |object: &ObjectLoss| HeldOutObject {
+                id: object.id,
+                label: label(field, object.id),
+                psnr: object.psnr,
+                psnr_lost: lost(object.psnr),
+                iou: object.iou,
+                iou_lost: lost(object.iou),
+            };
+            HeldOutReport {
+                frames: before.frames,
+                scene: ImageScores::of(before),
+                file: ImageScores::of(after),
+                psnr_lost: lost([before.psnr, after.psnr]),
+                miou_lost: lost([before.instance.miou, after.instance.miou]),
+                objects: found.objects.iter().map(object).collect(),
+            }
         });
-        let likeness = self.likeness.as_ref().map(|found| {
-            let objects: Vec<Value> = found.objects.iter().map(|object| json!({
-                "id": object.id, "label": label(field, object.id), "psnr": object.psnr, "iou": object.iou,
-            })).collect();
-            json!({ "views": found.views, "psnr": found.psnr, "miou": found.miou, "objects": objects })
+        let against_scene = self.likeness.as_ref().map(|found| {
+            let object = |object: &ObjectLikeness| LikenessObject {
+                id: object.id,
+                label: label(field, object.id),
+                psnr: object.psnr,
+                iou: object.iou,
+            };
+            LikenessReport {
+                views: found.views,
+                psnr: found.psnr,
+                miou: found.miou,
+                objects: found.objects.iter().map(object).collect(),
+            }
         });
-        json!({
-            "file": self.path,
-            "format": self.format,
-            "time_code": self.moment,
-            "read_s": self.read_s,
-            "seconds": self.seconds,
-            "against_scene": likeness,
-            "held_out": held_out,
-        })
+        FileCheck {
+            file: &self.path,
+            format: self.format,
+            time_code: self.moment,
+            read_s: self.read_s,
+            seconds: self.seconds,
+            against_scene,
+            held_out,
+        }
     }
 
     /// Prints the tables.
@@ -385,7 +484,7 @@ fn print_held_out(found: &HeldOutLoss, field: &Field) {
     }
 }
 
-/// What to do about a file that shows less than its scene by so many decibels; `None` where it shows as good as all.
+/// Advice about a file whose views lose so many decibels against its scene; `None` where the loss is small.
 fn advice(lost: Option<f64>) -> Option<String> {
     let lost = lost.filter(|lost| *lost > MUCH_DB)?;
     Some(format!(

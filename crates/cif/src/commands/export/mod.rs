@@ -4,14 +4,15 @@ mod check;
 mod preset;
 mod targets;
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use cif_dataset::MotionTruth;
 use cif_field::Field;
+use cif_scene::graph::ReportRow;
 use cif_scene::{FrameRange, MotionModel, Node, SceneFormat, SceneGraph, SceneOptions, Tolerance, UpAxis};
 use clap::{ArgGroup, Args};
 use serde::Serialize;
-use serde_json::json;
 
 use super::shared::model_options::ModelOptions;
 use super::shared::{motion_table, scene};
@@ -22,8 +23,8 @@ use crate::interrupt;
 use crate::messages::note;
 use crate::moment::Frames;
 use crate::output::Outputs;
-use crate::report::Report;
-use check::{Check, Finding};
+use crate::report::{JsonReport, Report};
+use check::{Check, FileCheck, Finding};
 use preset::{Preferred, Preset};
 use targets::{FILES, Targets, Writing};
 
@@ -36,7 +37,8 @@ use targets::{FILES, Targets, Writing};
 Poses that the scene records for an object, trained or imported, leave as they are, whatever the
 tolerance. Every other object gets the cheapest motion that stays inside the tolerance: static, rigid,
 parts (a few rigid bodies), or dense (a path for every splat), without the samples that interpolation
-reproduces inside the tolerance. The table tells which motion was chosen, and what it misses.
+reproduces inside the tolerance. The table shows the chosen motion models and
+their residuals.
 
   cif export table.cif table.usda
   cif export table.cif table.usdz --tolerance 0.5%
@@ -46,7 +48,7 @@ reproduces inside the tolerance. The table tells which motion was chosen, and wh
   cif export table.cif --report --ground-truth motion.json
   cif export table.cif table.usda --for mujoco          or newton, isaac, blender, web: --help shows their flags
 
---check reads every file back as `cif import` would and draws it beside the scene, from cameras that
+--check reads every file back as `cif import` would and compares it with the scene, from cameras that
 the scene recorded and, with --capture, from those of held-out images. PSNR of an object is over the
 pixels where the scene shows it; IoU is against where the scene shows it, or against the masks of the
 held-out images. A PLY is compared at its moment, and has no objects.
@@ -59,7 +61,7 @@ pub(super) struct Export {
     scene: PathBuf,
     #[command(flatten)]
     targets: Targets,
-    /// Options for the program that opens the files; flags that are given besides overrule it
+    /// Options for the program that opens the files; flags on the command line override it
     #[arg(long = "for", value_name = "PROGRAM")]
     preset: Option<Preset>,
     #[command(flatten)]
@@ -96,7 +98,7 @@ pub(super) struct Export {
     /// in which thin parts vanish; for viewers alone: cif and viewers with a filter would blur twice
     #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true")]
     bake_blur: Option<bool>,
-    /// Print the motion table even when nothing is written
+    /// Print the motion table even if no file is written
     #[arg(long)]
     report: bool,
     #[command(flatten)]
@@ -123,7 +125,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     let bakes_blur = command.bake_blur.or(preferred.bake_blur).unwrap_or_default();
     command.check.refuse(&command.targets, &command.writing, &preferred, bakes_blur)?;
     if let Some(preset) = command.preset {
-        note!("--for {} is {}; flags that are given besides overrule it", preset.name(), preset.flags());
+        note!("--for {} is {}; flags on the command line override it", preset.name(), preset.flags());
     }
     let truth = command.ground_truth.as_deref().map(MotionTruth::read).transpose().map_err(Error::plain)?;
     let field = scene::load(&command.scene)?;
@@ -150,7 +152,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         let other = target.format.rebuilt(&field, &graph, &options).map_err(Error::plain)?;
         let held = other.as_ref().unwrap_or(&graph);
         let written = formats::write(target.format, held, &target.path, &writing)?;
-        target.tell(&written);
+        target.report(&written);
         if let Some(checker) = &checker {
             findings.push(checker.check(target, held, &writing)?);
         }
@@ -158,18 +160,22 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     }
     let errors = truth.map(|truth| ground_truth::compare(&graph, &truth));
     let masses = masses(&graph, writing.density);
-    let mut tables = json!({ "motion": graph.motion_table(), "ground_truth": errors, "masses": masses });
     let simplifies = |most: MotionModel| most < MotionModel::Dense;
-    for format in
-        FORMATS.into_iter().filter(|format| format.about().most_expensive_motion.is_some_and(simplifies))
-    {
+    let simplified = |format: &dyn SceneFormat| {
         let table = rebuilt.iter().find(|(other, _)| other.about().key == format.about().key);
-        tables[format!("{}_motion", format.about().key)] =
-            json!(table.map(|(_, graph)| graph.motion_table()));
-    }
-    if checker.is_some() {
-        tables["check"] = findings.iter().map(|finding| finding.json(&field)).collect();
-    }
+        (format!("{}_motion", format.about().key), table.map(|(_, graph)| graph.motion_table()))
+    };
+    let tables = || ExportReport {
+        motion: graph.motion_table(),
+        ground_truth: errors.as_deref(),
+        masses: &masses,
+        simplified: FORMATS
+            .into_iter()
+            .filter(|format| format.about().most_expensive_motion.is_some_and(simplifies))
+            .map(simplified)
+            .collect(),
+        check: checker.is_some().then(|| findings.iter().map(|finding| finding.report(&field)).collect()),
+    };
     let print = || {
         print_motion(&graph, &masses);
         for (format, graph) in &rebuilt {
@@ -184,14 +190,37 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         }
         findings.iter().for_each(|finding| finding.print(&field));
     };
-    command.tables.give(|| tables.clone(), print)
+    command.tables.give(tables, print)
 }
 
-/// Mass of an object, in the order of the nodes.
+/// Motion, masses and losses of an exported scene.
+#[derive(Debug, Serialize)]
+struct ExportReport<'a> {
+    /// Motion of every node.
+    motion: Vec<ReportRow>,
+    /// Errors of objects with known motion; null without `--ground-truth`.
+    ground_truth: Option<&'a [MotionError]>,
+    /// Masses, in the order of the nodes.
+    masses: &'a [Mass],
+    /// `gltf_motion`: motion of every node in the file, where the format holds simpler motion than the scene has; null
+    /// where it does not have to, or no such file was written.
+    #[serde(flatten)]
+    simplified: BTreeMap<String, Option<Vec<ReportRow>>>,
+    /// Every file that was read back and compared with the scene; absent without `--check`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    check: Option<Vec<FileCheck<'a>>>,
+}
+
+impl JsonReport for ExportReport<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif export"];
+}
+
+/// Mass of an object.
 #[derive(Debug, Serialize)]
 struct Mass {
+    /// Name of the node.
     name: String,
-    /// `None` without a collider.
+    /// Kilograms; null without a collider.
     kilograms: Option<f64>,
 }
 

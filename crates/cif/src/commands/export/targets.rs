@@ -104,7 +104,7 @@ pub(super) struct Writing {
     /// Leave out the variants with half and a quarter of the splats
     #[arg(long)]
     no_lod: bool,
-    /// A plane for simulators, on which things fall: auto (where the objects stand), none, or its height in world units
+    /// A ground plane for simulators: auto (where the objects stand), none, or its height in world units
     /// [default: none]
     #[arg(long, value_name = "WHERE", allow_hyphen_values = true)]
     ground: Option<Ground>,
@@ -238,7 +238,7 @@ impl Target {
     }
 
     /// Tells what was written.
-    pub(super) fn tell(&self, summary: &ExportSummary) {
+    pub(super) fn report(&self, summary: &ExportSummary) {
         for lost in &summary.not_held {
             crate::messages::warning!("{} does not hold everything of {lost}", self.format.about().name);
         }

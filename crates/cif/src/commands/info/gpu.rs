@@ -1,23 +1,24 @@
 //! `cif info --gpu`: GPUs, their features and limits, and what of them is used.
 
+use std::collections::BTreeMap;
+
 use cif_render::wgpu::{AdapterFacts, Gpu, GpuError, GpuFeatures, Rasterizer, SubgroupUse};
-use serde_json::{Value, json};
+use serde::Serialize;
 
 use crate::error::Error;
-use crate::report::OnlyReport;
+use crate::report::{JsonReport, OnlyReport};
 
 pub(super) fn run(report: &OnlyReport) -> Result<(), Error> {
     let allowed = GpuFeatures::from_environment().map_err(Error::plain)?;
     let adapters = Gpu::adapters();
     // Opened like any command would, kernels included: a GPU that is listed may still refuse.
     let opened = Gpu::open_with(allowed).and_then(|gpu| Rasterizer::new(&gpu).map(|_| gpu));
-    let report_of = || {
-        let adapters: Vec<Value> = adapters.iter().map(|adapter| facts(adapter, allowed)).collect();
-        let (used, subgroups, fault) = match &opened {
-            Ok(gpu) => (json!(gpu.facts().name), json!(gpu.subgroups().to_string()), Value::Null),
-            Err(error) => (Value::Null, Value::Null, json!(error.to_string())),
-        };
-        json!({ "adapters": adapters, "used": used, "used_subgroups": subgroups, "fault": fault })
+    let gpu = opened.as_ref().ok();
+    let report_of = || GpuReport {
+        adapters: adapters.iter().map(|adapter| facts(adapter, allowed)).collect(),
+        used: gpu.map(|gpu| gpu.facts().name.as_str()),
+        used_subgroups: gpu.map(|gpu| gpu.subgroups().to_string()),
+        fault: opened.as_ref().err().map(ToString::to_string),
     };
     report.give(report_of, || print_all(&adapters, &opened, allowed))
 }
@@ -67,23 +68,67 @@ fn paths(adapter: &AdapterFacts, allowed: GpuFeatures) -> Vec<String> {
     paths
 }
 
-fn facts(adapter: &AdapterFacts, allowed: GpuFeatures) -> Value {
-    let limits: serde_json::Map<String, Value> =
-        adapter.limits.iter().map(|(name, value)| (name.replace(' ', "_"), json!(value))).collect();
-    json!({
-        "name": adapter.name,
-        "interface": adapter.interface,
-        "kind": adapter.kind,
-        "driver": adapter.driver,
-        "software": adapter.software,
-        "timestamps": adapter.timestamps,
-        "subgroups": adapter.subgroups,
-        "half_floats": adapter.half_floats,
-        "packed_half_floats": adapter.packed_half_floats,
-        "limits": limits,
-        "missing": adapter.missing,
-        "used": paths(adapter, allowed),
-    })
+/// GPUs that are offered, and the one that is used.
+#[derive(Serialize)]
+struct GpuReport<'a> {
+    /// Every adapter that Vulkan, Metal and Direct3D 12 offer, GPUs before software.
+    adapters: Vec<AdapterReport<'a>>,
+    /// Name of the adapter that is used; null where none can be.
+    used: Option<&'a str>,
+    /// How its subgroups are used, in words.
+    used_subgroups: Option<String>,
+    /// Reason why no adapter can be used.
+    fault: Option<String>,
+}
+
+/// An adapter.
+#[derive(Serialize)]
+struct AdapterReport<'a> {
+    /// Name, as the driver has it.
+    name: &'a str,
+    /// Vulkan, Metal or Direct3D 12.
+    interface: &'a str,
+    /// Discrete, integrated, virtual, software or other.
+    kind: &'static str,
+    /// Driver and its version.
+    driver: &'a str,
+    /// True when the processor does the work of the GPU.
+    software: bool,
+    /// True when kernels can be timed on the device.
+    timestamps: bool,
+    /// Least and largest size of its subgroups; null where kernels cannot use them.
+    subgroups: Option<(u32, u32)>,
+    /// True when kernels can compute in 16-bit floats.
+    half_floats: bool,
+    /// True when kernels can read numbers that are stored in 16-bit floats.
+    packed_half_floats: bool,
+    /// Limits that decide how large a scene may be, by name.
+    limits: BTreeMap<String, u64>,
+    /// Limits below those that the kernels need; empty when they run.
+    missing: &'a [String],
+    /// Features that kernels use, in words.
+    used: Vec<String>,
+}
+
+impl JsonReport for GpuReport<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif info --gpu"];
+}
+
+fn facts(adapter: &AdapterFacts, allowed: GpuFeatures) -> AdapterReport<'_> {
+    AdapterReport {
+        name: &adapter.name,
+        interface: &adapter.interface,
+        kind: adapter.kind,
+        driver: &adapter.driver,
+        software: adapter.software,
+        timestamps: adapter.timestamps,
+        subgroups: adapter.subgroups,
+        half_floats: adapter.half_floats,
+        packed_half_floats: adapter.packed_half_floats,
+        limits: adapter.limits.iter().map(|(name, value)| (name.replace(' ', "_"), *value)).collect(),
+        missing: &adapter.missing,
+        used: paths(adapter, allowed),
+    }
 }
 
 fn print(adapter: &AdapterFacts, allowed: GpuFeatures) {

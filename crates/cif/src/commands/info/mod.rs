@@ -6,15 +6,15 @@ mod gpu;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
-use cif_dataset::{Dataset, PointSource, Split};
-use cif_field::{Checkpoint, Field, Record};
-use cif_geometry::Bounds;
+use cif_dataset::{Dataset, InstanceLabel, Layout, PointSource, Split};
+use cif_field::{Checkpoint, Field, Instance, Record};
+use cif_geometry::{Bounds, CaptureFrame};
 use cif_scene::SceneOptions;
 use cif_scene::from_field::assignment::members;
 use cif_train::{Curve, Stage};
 use clap::Args;
 use glam::DVec3;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::shared::object_motion::ObjectMotion;
@@ -22,7 +22,7 @@ use super::shared::scene;
 use crate::commands::shared::CaptureOptions;
 use crate::error::Error;
 use crate::formats;
-use crate::report::OnlyReport;
+use crate::report::{JsonReport, OnlyReport, Stored};
 
 /// Show what is in a capture or a trained scene, or what GPUs there are
 #[derive(Debug, Args)]
@@ -50,130 +50,265 @@ pub(super) fn run(command: &Info) -> Result<(), Error> {
         return gpu::run(&command.report);
     }
     let Some(path) = &command.path else {
-        return Err(Error::usage("nothing to tell of", "name a capture or a scene"));
+        return Err(Error::usage("no capture or scene is given", "name a capture or a scene"));
     };
     command.report.check([path.as_path()])?;
-    let facts = if path.is_file() {
+    if path.is_file() {
         let checkpoint = Checkpoint::load(path).map_err(Error::plain)?;
-        scene_facts(&checkpoint)
+        give(&command.report, scene_facts(&checkpoint))
     } else if formats::is_field(path) {
-        return scene::load(path).map(drop);
+        scene::load(path).map(drop)
     } else {
-        capture_facts(&command.capture_options.open(path)?)?
-    };
-    command.report.give(|| Value::Object(facts.iter().cloned().collect()), || print(&facts))
+        give(&command.report, capture_facts(command.capture_options.open(path)?))
+    }
 }
 
-/// Facts in the order they are told.
-type Facts = Vec<(String, Value)>;
+fn give(report: &OnlyReport, facts: impl Facts) -> Result<(), Error> {
+    let printed = facts.in_order();
+    report.give(|| facts, || print(&printed))
+}
 
-fn capture_facts(dataset: &Dataset) -> Result<Facts, Error> {
+/// A report whose fields are also printed, in their order.
+trait Facts: JsonReport {
+    /// Names and values of the fields.
+    fn in_order(&self) -> Vec<(&'static str, Value)>;
+}
+
+/// Declares a report whose fields are also printed.
+macro_rules! facts {
+    (
+        $(#[$of_report:meta])*
+        struct $name:ident { $($(#[$of_field:meta])* $field:ident: $kind:ty,)+ }
+    ) => {
+        $(#[$of_report])*
+        #[derive(Serialize)]
+        struct $name { $($(#[$of_field])* $field: $kind,)+ }
+
+        impl Facts for $name {
+            fn in_order(&self) -> Vec<(&'static str, Value)> {
+                vec![$((stringify!($field), json!(self.$field))),+]
+            }
+        }
+    };
+}
+
+facts! {
+    /// A capture.
+    struct CaptureFacts {
+        /// Its folder.
+        capture: String,
+        /// Layout of its files.
+        layout: Layout,
+        /// Frames.
+        frames: usize,
+        /// Frames that are trained on.
+        train: usize,
+        /// Frames that are held out.
+        val: usize,
+        /// Frames of every group, by its name.
+        groups: BTreeMap<String, usize>,
+        /// Names of the cameras.
+        cameras: BTreeSet<String>,
+        /// Different times.
+        times: usize,
+        /// Frames per second; null where that is not known.
+        frames_per_second: Option<f64>,
+        /// Sizes of the images as they are loaded, `WIDTH x HEIGHT` in pixels.
+        resolution: BTreeSet<String>,
+        /// Least and largest focal length, pixels.
+        focal_px: [f64; 2],
+        /// Frames whose lens distortion is removed.
+        frames_with_lens_distortion: usize,
+        /// True where images have an alpha channel.
+        alpha: bool,
+        /// Frames that have a mask.
+        frames_with_masks: usize,
+        /// Instances of the masks.
+        instances: Vec<InstanceLabel>,
+        /// Points that training starts from.
+        points: usize,
+        /// Origin of the points: their file, or in words.
+        points_from: String,
+        /// Box of the points, capture coordinates; null without points.
+        points_box: Option<BoxReport>,
+        /// Box of the cameras, capture coordinates.
+        camera_box: Option<BoxReport>,
+        /// Place of the coordinates in the world of the capture; null where they are the same.
+        frame: Option<CaptureFrame>,
+        /// Notes of reading it.
+        notes: Vec<String>,
+        /// Warnings of reading it.
+        warnings: Vec<String>,
+    }
+}
+
+impl JsonReport for CaptureFacts {
+    const COMMANDS: &'static [&'static str] = &["cif info CAPTURE"];
+}
+
+facts! {
+    /// A trained scene.
+    struct SceneFacts {
+        /// Gaussians.
+        gaussians: usize,
+        /// True where a deformation moves Gaussians.
+        moving: bool,
+        /// Degree of the spherical harmonics.
+        sh_degree: u8,
+        /// Captured times.
+        times: usize,
+        /// Frames per second.
+        frames_per_second: f64,
+        /// Names of the cameras.
+        cameras: BTreeSet<String>,
+        /// Box of the centres of the Gaussians.
+        r#box: Option<BoxReport>,
+        /// Extent of the scene that learning rates are relative to, world units.
+        extent: f32,
+        /// Instances.
+        instances: Vec<InstanceFacts>,
+        /// True where training can be continued.
+        resumable: bool,
+        /// Seconds of every stage of the training, by name; null where they are not recorded.
+        stages: Option<Value>,
+        /// Counts of the work of the training, by name; null where they are not recorded.
+        work: Option<Value>,
+        /// Quality over training time; null where it was not measured.
+        curve: Option<Stored<Curve>>,
+        /// Embeddings of the instances; null without any.
+        embeddings: Option<EmbeddingFacts>,
+        /// Record of how the scene came about, without embeddings.
+        provenance: Value,
+    }
+}
+
+impl JsonReport for SceneFacts {
+    const COMMANDS: &'static [&'static str] = &["cif info SCENE.cif"];
+}
+
+/// An axis-aligned box.
+#[derive(Serialize)]
+struct BoxReport {
+    /// Corner of the least coordinates.
+    from: [f64; 3],
+    /// Corner of the largest coordinates.
+    to: [f64; 3],
+}
+
+/// An instance of a scene.
+#[derive(Serialize)]
+struct InstanceFacts {
+    /// Mask id.
+    id: u16,
+    /// Label.
+    label: String,
+    /// Class.
+    category: String,
+    /// Names in other taxonomies, by taxonomy.
+    taxonomies: BTreeMap<String, String>,
+    /// Gaussians.
+    gaussians: usize,
+    /// Motion.
+    motion: ObjectMotion,
+}
+
+/// Embeddings of the instances of a scene.
+#[derive(Serialize)]
+struct EmbeddingFacts {
+    /// Model that made them.
+    model: String,
+    /// Instances that have one.
+    instances: usize,
+}
+
+fn capture_facts(dataset: Dataset) -> CaptureFacts {
     let frames = &dataset.frames;
     let count = |split| frames.iter().filter(|frame| frame.split == split).count();
-    let mut groups: BTreeMap<&str, usize> = BTreeMap::new();
-    for group in frames.iter().filter_map(|frame| frame.group.as_deref()) {
-        *groups.entry(group).or_default() += 1;
+    let mut groups: BTreeMap<String, usize> = BTreeMap::new();
+    for group in frames.iter().filter_map(|frame| frame.group.as_ref()) {
+        *groups.entry(group.clone()).or_default() += 1;
     }
-    let cameras: BTreeSet<&str> = frames.iter().map(|frame| frame.camera_name.as_str()).collect();
-    let sizes: BTreeSet<String> =
-        frames.iter().map(|frame| format!("{} x {}", frame.camera.width, frame.camera.height)).collect();
     let focal: Vec<f64> = frames.iter().map(|frame| frame.camera.focal_px.x).collect();
-    let masks = frames.iter().filter(|frame| frame.mask.is_some()).count();
-    let lenses = frames.iter().filter(|frame| !frame.lens.is_identity()).count();
     let centres = Bounds::around(frames.iter().map(|frame| frame.camera.centre()));
     let points = Bounds::around(dataset.points.positions.iter().map(|p| DVec3::from(p.map(f64::from))));
-    let source = match &dataset.points.source {
-        PointSource::File(path) => path.display().to_string(),
-        PointSource::Triangulated => "its own images".to_owned(),
-        PointSource::Random => "random, in the box that the cameras see".to_owned(),
-    };
-    Ok(vec![
-        ("capture".to_owned(), json!(dataset.root.display().to_string())),
-        ("layout".to_owned(), json!(dataset.layout)),
-        ("frames".to_owned(), json!(frames.len())),
-        ("train".to_owned(), json!(count(Split::Train))),
-        ("val".to_owned(), json!(count(Split::Val))),
-        ("groups".to_owned(), json!(groups)),
-        ("cameras".to_owned(), json!(cameras)),
-        ("times".to_owned(), json!(dataset.times.len())),
-        ("frames_per_second".to_owned(), json!(dataset.frames_per_second)),
-        ("resolution".to_owned(), json!(sizes)),
-        ("focal_px".to_owned(), json!(range(&focal))),
-        ("frames_with_lens_distortion".to_owned(), json!(lenses)),
-        ("alpha".to_owned(), json!(dataset.has_alpha)),
-        ("frames_with_masks".to_owned(), json!(masks)),
-        ("instances".to_owned(), json!(dataset.instances)),
-        ("points".to_owned(), json!(dataset.points.positions.len())),
-        ("points_from".to_owned(), json!(source)),
-        ("points_box".to_owned(), corners(&points)),
-        ("camera_box".to_owned(), corners(&centres)),
-        ("frame".to_owned(), json!((!dataset.frame.is_identity()).then_some(dataset.frame))),
-        ("notes".to_owned(), json!(dataset.notes)),
-        ("warnings".to_owned(), json!(dataset.warnings)),
-    ])
+    CaptureFacts {
+        capture: dataset.root.display().to_string(),
+        layout: dataset.layout,
+        frames: frames.len(),
+        train: count(Split::Train),
+        val: count(Split::Val),
+        groups,
+        cameras: frames.iter().map(|frame| frame.camera_name.clone()).collect(),
+        times: dataset.times.len(),
+        frames_per_second: dataset.frames_per_second,
+        resolution: frames
+            .iter()
+            .map(|frame| format!("{} x {}", frame.camera.width, frame.camera.height))
+            .collect(),
+        focal_px: range(&focal),
+        frames_with_lens_distortion: frames.iter().filter(|frame| !frame.lens.is_identity()).count(),
+        alpha: dataset.has_alpha,
+        frames_with_masks: frames.iter().filter(|frame| frame.mask.is_some()).count(),
+        points: dataset.points.positions.len(),
+        points_from: match &dataset.points.source {
+            PointSource::File(path) => path.display().to_string(),
+            PointSource::Triangulated => "its own images".to_owned(),
+            PointSource::Random => "random, in the box that the cameras see".to_owned(),
+        },
+        points_box: corners(&points),
+        camera_box: corners(&centres),
+        frame: (!dataset.frame.is_identity()).then_some(dataset.frame),
+        instances: dataset.instances,
+        notes: dataset.notes,
+        warnings: dataset.warnings,
+    }
 }
 
-fn scene_facts(checkpoint: &Checkpoint) -> Facts {
+fn scene_facts(checkpoint: &Checkpoint) -> SceneFacts {
     let field: &Field = &checkpoint.field;
-    // Nobody reads their numbers.
-    let embeddings = field.record.embeddings.as_ref();
-    let embeddings = embeddings.map(|all| json!({ "model": all.model, "instances": all.of.len() }));
-    let record = Record { embeddings: None, ..field.record.clone() };
+    let facts = |(instance, rows): (&Instance, &Vec<u32>)| InstanceFacts {
+        id: instance.id,
+        label: instance.label.clone(),
+        category: instance.category.clone(),
+        taxonomies: instance.taxonomies.clone(),
+        gaussians: rows.len(),
+        motion: ObjectMotion::of(field, rows),
+    };
     let means = Bounds::around(field.gaussians.means.iter().map(|p| DVec3::from(p.map(f64::from))));
-    let owned = members(field, &SceneOptions::default());
-    let instances: Vec<Value> = field
-        .instances
-        .iter()
-        .zip(&owned)
-        .map(|(instance, rows)| {
-            json!({
-                "id": instance.id,
-                "label": instance.label,
-                "category": instance.category,
-                "taxonomies": instance.taxonomies,
-                "gaussians": rows.len(),
-                "motion": ObjectMotion::of(field, rows),
-            })
-        })
-        .collect();
-    let cameras: BTreeSet<&str> = field.cameras.iter().map(|camera| camera.name.as_str()).collect();
-    vec![
-        ("gaussians".to_owned(), json!(field.gaussians.len())),
-        ("moving".to_owned(), json!(field.deformation.is_some())),
-        ("sh_degree".to_owned(), json!(field.sh_degree)),
-        ("times".to_owned(), json!(field.timeline.times.len())),
-        ("frames_per_second".to_owned(), json!(field.timeline.frames_per_second)),
-        ("cameras".to_owned(), json!(cameras)),
-        ("box".to_owned(), corners(&means)),
-        ("extent".to_owned(), json!(field.extent)),
-        ("instances".to_owned(), json!(instances)),
-        ("resumable".to_owned(), json!(checkpoint.training.is_some())),
-        (
-            "stages".to_owned(),
-            json!(field.record.run.as_ref().and_then(|run| run.notes.get("seconds_by_stage"))),
-        ),
-        ("work".to_owned(), json!(field.record.run.as_ref().and_then(|run| run.notes.get("work")))),
-        ("curve".to_owned(), json!(field.record.curve)),
-        ("embeddings".to_owned(), json!(embeddings)),
-        ("provenance".to_owned(), record.to_json()),
-    ]
+    // Nobody reads the numbers of embeddings.
+    let embeddings = field.record.embeddings.as_ref();
+    let record = Record { embeddings: None, ..field.record.clone() };
+    SceneFacts {
+        gaussians: field.gaussians.len(),
+        moving: field.deformation.is_some(),
+        sh_degree: field.sh_degree,
+        times: field.timeline.times.len(),
+        frames_per_second: field.timeline.frames_per_second,
+        cameras: field.cameras.iter().map(|camera| camera.name.clone()).collect(),
+        r#box: corners(&means),
+        extent: field.extent,
+        instances: field.instances.iter().zip(&members(field, &SceneOptions::default())).map(facts).collect(),
+        resumable: checkpoint.training.is_some(),
+        stages: field.record.run.as_ref().and_then(|run| run.notes.get("seconds_by_stage")).cloned(),
+        work: field.record.run.as_ref().and_then(|run| run.notes.get("work")).cloned(),
+        curve: field.record.curve.clone().map(Stored::from),
+        embeddings: embeddings
+            .map(|all| EmbeddingFacts { model: all.model.clone(), instances: all.of.len() }),
+        provenance: record.to_json(),
+    }
 }
 
 fn range(values: &[f64]) -> [f64; 2] {
     values.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], v| [low.min(*v), high.max(*v)])
 }
 
-fn corners(bounds: &Bounds) -> Value {
-    if bounds.is_empty() {
-        Value::Null
-    } else {
-        json!({ "from": bounds.low.to_array(), "to": bounds.high.to_array() })
-    }
+fn corners(bounds: &Bounds) -> Option<BoxReport> {
+    (!bounds.is_empty()).then(|| BoxReport { from: bounds.low.to_array(), to: bounds.high.to_array() })
 }
 
-fn print(facts: &Facts) {
+fn print(facts: &[(&'static str, Value)]) {
     for (name, value) in facts {
-        let name = name.replace('_', " ");
+        let name = name.trim_start_matches("r#").replace('_', " ");
         match value {
             Value::Array(items) if items.is_empty() => println!("{name:>28}  none"),
             Value::Array(items) if items.iter().all(Value::is_object) => {

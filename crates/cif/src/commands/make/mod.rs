@@ -7,14 +7,13 @@ use std::path::{Path, PathBuf};
 
 use cif_dataset::{Dataset, MadeFrom, OpenOptions};
 use cif_field::Checkpoint;
-use clap::{Args, Parser};
-use serde_json::json;
+use clap::Args;
+use serde::Serialize;
 
 use self::record::{Record, State};
-use super::{Arguments, dispatch};
 use crate::commands::shared::command_line;
 use crate::error::Error;
-use crate::report::OnlyReport;
+use crate::report::{JsonReport, OnlyReport};
 
 /// The file that objects leave in: USD, where this build writes it.
 const STAGE: (&str, &str) =
@@ -26,22 +25,22 @@ const PROPOSED: usize = 4;
 /// Go from videos or photographs to a USD stage: all steps with their defaults
 #[derive(Debug, Args)]
 #[command(after_help = "\
-Every step is a command of its own, which is shown before it runs, and leaves its result in the output folder:
+Every step is a cif command, which is printed before it runs and writes into the output folder:
 
   capture/     cif capture           frames, cameras, times
-  keyframes/   you                   masks of a few frames, painted: it stops here and says which
+  keyframes/   you                   painted masks of a few frames: it stops here and lists them
   masks/       cif masks propagate   masks of all frames
   scene.cif    cif train             the trained scene
   scene.usda   cif export            one moving prim per object (scene.glb in builds without USD)
 
-The same command goes on where it stopped, also after Ctrl-C: what is there already is not made again unless something
-that it was made from has changed, be it a file, a setting or the version of cif; then it and all that follows is made
-again, and it says why. made.json holds what each step was made from. A step that needs other options can be run by hand
-into the same place: what is not as cif make left it is never replaced.
+Run the same command again to continue, also after Ctrl-C. A step is repeated only if one of its inputs has changed (a
+file, a setting or the version of cif); the steps after it are then repeated too, and the reason is printed. made.json
+lists the inputs of each step. A step that needs other options can be run by hand into the same place: files that cif
+make did not write, or that were changed since, are never replaced.
 
   cif make phone.mp4 -o table
   cif make left.mp4 right.mp4 -o rig --preset draft
-  cif make captures/table -o table                    a capture with masks is trained and exported at once
+  cif make captures/table -o table                    a capture that has masks: train and export
   cif make captures/table -o table --masks tracked    masks of a tracker (cif masks import)")]
 pub(super) struct Make {
     /// Videos and folders of photographs, as `cif capture` takes them, or the folder of one capture
@@ -53,7 +52,7 @@ pub(super) struct Make {
     /// Painted masks of a few frames, PNG files of ids named as the frames [default: DIR/keyframes]
     #[arg(long, value_name = "DIR", conflicts_with = "masks")]
     keyframes: Option<PathBuf>,
-    /// Go on with the frames that are painted, although they are fewer than asked for
+    /// Continue with the painted frames, even if they are fewer than requested
     #[arg(long, conflicts_with = "masks")]
     as_painted: bool,
     /// Masks of all frames, or a file for each frame of the video, so that none has to be painted
@@ -71,7 +70,27 @@ pub(super) struct Make {
     quiet: bool,
 }
 
-pub(super) fn run(command: &Make) -> Result<(), Error> {
+/// Files that were made, or were there already.
+#[derive(Serialize)]
+struct MakeReport<'a> {
+    /// Folder of the capture.
+    capture: &'a Path,
+    /// Folder of the masks; null where the capture has its own.
+    masks: Option<&'a Path>,
+    /// The trained scene.
+    scene: &'a Path,
+    /// The exported stage, or glTF file in builds without USD.
+    stage: &'a Path,
+}
+
+impl JsonReport for MakeReport<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif make"];
+}
+
+/// Runs a command line of cif.
+type RunLine = fn(Vec<OsString>) -> Result<(), Error>;
+
+pub(super) fn run(command: &Make, run_line: RunLine) -> Result<(), Error> {
     command.report.check([])?;
     if command.report.to_stdout() {
         return Err(Error::usage(
@@ -84,9 +103,9 @@ pub(super) fn run(command: &Make) -> Result<(), Error> {
     cif_usd::usd_version().map_err(Error::plain)?;
     crate::output::check_new_folder(&command.output.join("capture"))?;
     let mut record = Record::read(&command.output)?;
-    let capture = command.capture(&mut record)?;
-    let masks = command.masks(&capture, &mut record)?;
-    let scene = command.train(&capture, masks.as_deref(), &mut record)?;
+    let capture = command.capture(&mut record, run_line)?;
+    let masks = command.masks(&capture, &mut record, run_line)?;
+    let scene = command.train(&capture, masks.as_deref(), &mut record, run_line)?;
     let (flag, name) = STAGE;
     let stage = command.output.join(name);
     let mut made_from = version();
@@ -101,10 +120,10 @@ pub(super) fn run(command: &Make) -> Result<(), Error> {
             words.extend(["--masks".into(), masks.clone().into()]);
         }
         words.extend(matches!(state, State::Stale(_)).then(|| "--force".into()));
-        step(words, None)?;
+        step(run_line, words, None)?;
         record.end("stage", &stage)?;
     }
-    let report = json!({ "capture": capture, "masks": masks, "scene": scene, "stage": stage });
+    let report = MakeReport { capture: &capture, masks: masks.as_deref(), scene: &scene, stage: &stage };
     command.report.give(
         || report,
         || {
@@ -116,7 +135,7 @@ pub(super) fn run(command: &Make) -> Result<(), Error> {
 
 impl Make {
     /// The capture, made of the inputs unless they are one.
-    fn capture(&self, record: &mut Record) -> Result<PathBuf, Error> {
+    fn capture(&self, record: &mut Record, run_line: RunLine) -> Result<PathBuf, Error> {
         if let [input] = self.inputs.as_slice()
             && OpenOptions::default().layout_of(Path::new(input)).is_ok()
         {
@@ -151,14 +170,19 @@ impl Make {
             let mut words = vec!["capture".into()];
             words.extend(self.inputs.iter().cloned());
             words.extend(["-o".into(), place.clone().into()]);
-            instead(&state, &place, || step(self.quietly(words), STEP))?;
+            instead(&state, &place, || step(run_line, self.quietly(words), STEP))?;
             record.end("capture", &place)?;
         }
         Ok(place)
     }
 
     /// The folder of masks; `None` where the capture has its own.
-    fn masks(&self, capture: &Path, record: &mut Record) -> Result<Option<PathBuf>, Error> {
+    fn masks(
+        &self,
+        capture: &Path,
+        record: &mut Record,
+        run_line: RunLine,
+    ) -> Result<Option<PathBuf>, Error> {
         if let Some(masks) = &self.masks {
             return std::path::absolute(masks).map(Some).map_err(Error::io("find", masks));
         }
@@ -195,14 +219,20 @@ impl Make {
                 "-o".into(),
                 place.clone().into(),
             ]);
-            instead(&state, &place, || step(self.quietly(words.collect()), STEP))?;
+            instead(&state, &place, || step(run_line, self.quietly(words.collect()), STEP))?;
             record.end("masks", &place)?;
         }
         std::path::absolute(&place).map(Some).map_err(Error::io("find", &place))
     }
 
     /// The trained scene; a run that was interrupted goes on.
-    fn train(&self, capture: &Path, masks: Option<&Path>, record: &mut Record) -> Result<PathBuf, Error> {
+    fn train(
+        &self,
+        capture: &Path,
+        masks: Option<&Path>,
+        record: &mut Record,
+        run_line: RunLine,
+    ) -> Result<PathBuf, Error> {
         let scene = self.output.join("scene.cif");
         let options = OpenOptions { masks: masks.map(Path::to_owned), ..OpenOptions::default() };
         let dataset = Dataset::open(capture, &options).map_err(Error::plain)?;
@@ -232,7 +262,7 @@ impl Make {
             words.extend(preset.into_iter().chain(config).flatten());
             words.extend(matches!(state, State::Stale(_)).then(|| "--force".into()));
         }
-        step(self.quietly(words), None)?;
+        step(run_line, self.quietly(words), None)?;
         record.end("scene", &scene)?;
         Ok(scene)
     }
@@ -285,15 +315,15 @@ fn version() -> MadeFrom {
     MadeFrom::new().value("version", env!("CARGO_PKG_VERSION")).clone()
 }
 
-/// Tells a command not to say what comes next, which is told here.
+/// Keeps a command from printing the next step, which is printed here.
 const STEP: Option<&str> = Some("--step");
 
-/// Runs a command line of cif, and shows it without what is `untold`.
-fn step(words: Vec<OsString>, untold: Option<&str>) -> Result<(), Error> {
-    let told: Vec<String> = words.iter().map(|word| word.to_string_lossy().into_owned()).collect();
-    eprintln!("$ {}", command_line(&told));
-    let line = std::iter::once(OsString::from("cif")).chain(words).chain(untold.map(OsString::from));
-    dispatch(Arguments::try_parse_from(line).map_err(Error::plain)?.command)
+/// Runs a command line of cif, and shows it without the flag `hidden`.
+fn step(run_line: RunLine, words: Vec<OsString>, hidden: Option<&str>) -> Result<(), Error> {
+    let shown: Vec<String> = words.iter().map(|word| word.to_string_lossy().into_owned()).collect();
+    eprintln!("$ {}", command_line(&shown));
+    let line = std::iter::once(OsString::from("cif")).chain(words).chain(hidden.map(OsString::from));
+    run_line(line.collect())
 }
 
 /// Frames of the first camera that are proposed to be painted: the first and the last, and some between.
@@ -305,7 +335,7 @@ fn proposed(dataset: &Dataset) -> Vec<usize> {
     (0..count).map(|k| frames[k * (frames.len() - 1) / (count - 1).max(1)]).collect()
 }
 
-/// The stop at which a person is needed: frames to be painted, beside those that are.
+/// The stop at which a person is needed: frames to be painted, in addition to those that are.
 fn to_paint(dataset: &Dataset, frames: &[usize], painted: usize, keyframes: &Path, capture: &Path) -> Error {
     let line = |index: &usize| {
         let frame = &dataset.frames[*index];
@@ -318,7 +348,7 @@ fn to_paint(dataset: &Dataset, frames: &[usize], painted: usize, keyframes: &Pat
             format!(
                 "{painted} of {PROPOSED} frames are painted; masks of the others would be guessed from these. Missing:\n{lines}"
             ),
-            "paint them too, or as many other frames, and run the same command again; or go on with what is painted: \
+            "paint them too, or as many other frames, and run the same command again; or continue with the painted ones: \
              --as-painted",
         );
     }
@@ -332,7 +362,7 @@ fn to_paint(dataset: &Dataset, frames: &[usize], painted: usize, keyframes: &Pat
         format!("{} frames have to be painted:\n{lines}{named}", frames.len()),
         format!(
             "paint each object in the value of its id, 1 to 255, on 0 in an 8-bit grey or palette PNG of the same size \
-             (any paint program, or a tracker's first answer); name the ids in instances.json beside them, \
+             (any paint program, or a tracker's first answer); name the ids in instances.json next to them, \
              [{{\"id\": 1, \"label\": \"red mug\"}}]; then run the same command again; without objects: {}",
             command_line(&["train", &capture.display().to_string(), "-o", "scene.cif"])
         ),

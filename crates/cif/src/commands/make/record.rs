@@ -1,4 +1,4 @@
-//! Inputs that the steps of `cif make` were made from, in `made.json` beside their results.
+//! Inputs that the steps of `cif make` were made from, in `made.json` next to their results.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

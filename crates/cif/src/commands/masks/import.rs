@@ -1,23 +1,23 @@
 //! `cif masks import`: masks of other tools as masks of a capture.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use cif_dataset::masks::{Import as Source, MaskWriter, SourceKind};
 use cif_dataset::{Dataset, InstanceLabel, OpenOptions};
 use clap::{Args, ValueEnum};
-use serde_json::json;
+use serde::Serialize;
 
 use crate::commands::shared::{LayoutName, command_line, table};
 use crate::error::Error;
 use crate::interrupt;
 use crate::progress::FrameProgress;
-use crate::report::OnlyReport;
+use crate::report::{JsonReport, OnlyReport};
 
-/// Bring masks of other tools into the form that training reads
+/// Import masks of other tools
 #[derive(Debug, Args)]
 #[command(after_help = "\
-Recognised by what they hold, or named with --from:
+Recognised by their files, or named with --from:
 
   tracker         a PNG per frame: ids (grey or palette), or a colour per object (DEVA with Annotations/ and
                   pred.json, XMem, Cutie ...); black is unlabelled, other colours get ids in one table for all frames
@@ -49,7 +49,7 @@ pub(super) struct Import {
     /// Folder of the capture whose frames they show
     #[arg(long, value_name = "CAPTURE")]
     capture: PathBuf,
-    /// Read the source as this [default: what it holds]
+    /// Kind of the source [default: recognised by its files]
     #[arg(long, value_name = "TOOL")]
     from: Option<From>,
     /// Names of the masks end in numbers of frames of the video, and its first frame has this one [default: what the
@@ -170,23 +170,26 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
     let report = || {
         let objects = seen.iter().map(|instance| {
             let (frames, pixels) = found.objects[&instance.id];
-            json!({
-                "id": instance.id, "label": instance.label, "category": instance.category,
-                "frames": frames, "pixels": pixels,
-            })
+            ImportedObject {
+                id: instance.id,
+                label: &instance.label,
+                category: &instance.category,
+                frames,
+                pixels,
+            }
         });
-        json!({
-            "read_as": source.kind.described(),
-            "masks_in": command.output,
-            "frames": dataset.frames.len(),
-            "masks": found.masks,
-            "frames_without_mask": without,
-            "pixels": found.pixels,
-            "labelled_pixels": found.labelled,
-            "disputed_pixels": found.disputed,
-            "objects": objects.collect::<Vec<_>>(),
-            "objects_without_pixels": empty,
-        })
+        MaskImportReport {
+            read_as: source.kind.described(),
+            masks_in: &command.output,
+            frames: dataset.frames.len(),
+            masks: found.masks,
+            frames_without_mask: &without,
+            pixels: found.pixels,
+            labelled_pixels: found.labelled,
+            disputed_pixels: found.disputed,
+            objects: objects.collect(),
+            objects_without_pixels: &empty,
+        }
     };
     command.report.give(report, || print(command, &dataset, &found, &seen))?;
     for note in &source.notes {
@@ -212,6 +215,50 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
         crate::messages::warning!("no pixel shows {}; left out of instances.json", names.join(", "));
     }
     Ok(())
+}
+
+/// Masks of another tool that were imported.
+#[derive(Serialize)]
+struct MaskImportReport<'a> {
+    /// Kind of the source.
+    read_as: &'static str,
+    /// Folder of the masks.
+    masks_in: &'a Path,
+    /// Frames of the capture.
+    frames: usize,
+    /// Masks.
+    masks: usize,
+    /// Names of the frames that got no mask.
+    frames_without_mask: &'a [&'a str],
+    /// Pixels of all masks.
+    pixels: u64,
+    /// Pixels that belong to an object.
+    labelled_pixels: u64,
+    /// Pixels that several objects of the source claim.
+    disputed_pixels: u64,
+    /// Objects that a pixel shows.
+    objects: Vec<ImportedObject<'a>>,
+    /// Objects of the source that no pixel shows.
+    objects_without_pixels: &'a [InstanceLabel],
+}
+
+/// An object of imported masks.
+#[derive(Serialize)]
+struct ImportedObject<'a> {
+    /// Mask id.
+    id: u16,
+    /// Label.
+    label: &'a str,
+    /// Class.
+    category: &'a str,
+    /// Frames that show it.
+    frames: usize,
+    /// Pixels, over all frames.
+    pixels: u64,
+}
+
+impl JsonReport for MaskImportReport<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif masks import"];
 }
 
 fn print(command: &Import, dataset: &Dataset, found: &Found, seen: &[InstanceLabel]) {

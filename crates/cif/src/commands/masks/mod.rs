@@ -5,15 +5,16 @@ mod propagate;
 
 use std::path::{Path, PathBuf};
 
-use cif_dataset::masks::{INDEX_FILE, ViewOrder, ZigzagIndex, split_tracker_masks, write_zigzag};
+use cif_dataset::masks::{
+    INDEX_FILE, SplitReport, ViewOrder, ZigzagIndex, split_tracker_masks, write_zigzag,
+};
 use clap::{Args, Subcommand, ValueEnum};
-use serde_json::json;
 
 use crate::commands::shared::{CaptureOptions, print_warnings};
 use crate::error::Error;
-use crate::report::OnlyReport;
+use crate::report::{JsonReport, OnlyReport};
 
-/// Make masks: out of those of other tools, out of a few painted frames, or with a video tracker
+/// Make masks: import those of other tools, propagate a few painted frames, or run a video tracker
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Masks of trackers, annotation tools and compositors become the folder that training reads:
@@ -59,7 +60,7 @@ enum Step {
         #[command(flatten)]
         report: OnlyReport,
     },
-    /// Bring the ids of a tracker back to the cameras, and drop objects that some camera never sees
+    /// Assign the ids of a tracker to the cameras, and drop objects that some camera never sees
     Split {
         /// Folder that `cif masks zigzag` wrote
         sequence: PathBuf,
@@ -83,6 +84,14 @@ enum Order {
     Name,
     /// From one end of the rig, always on to the nearest camera left
     Greedy,
+}
+
+impl JsonReport for ZigzagIndex {
+    const COMMANDS: &'static [&'static str] = &["cif masks zigzag"];
+}
+
+impl JsonReport for SplitReport {
+    const COMMANDS: &'static [&'static str] = &["cif masks split"];
 }
 
 pub(super) fn run(command: &Masks) -> Result<(), Error> {
@@ -117,12 +126,12 @@ fn zigzag(
     };
     let index = write_zigzag(&dataset, output, order).map_err(Error::plain)?;
     report.give(
-        || json!(index),
+        || index.clone(),
         || {
             println!("{} images and {INDEX_FILE} in {}", index.images.len(), output.display());
             if index.is_multi_view() {
-                let (views, way) = (index.views.join(", "), index.view_path_m);
-                println!("cameras in order: {views}; way between them {way:.3} m");
+                let (views, length) = (index.views.join(", "), index.view_path_m);
+                println!("cameras in order: {views}; path between them {length:.3} m");
             } else {
                 println!("one view, in the order of the capture");
             }
@@ -140,7 +149,7 @@ fn split(
     let index = ZigzagIndex::load(sequence).map_err(Error::plain)?;
     let report = split_tracker_masks(&index, tracked, output, min_px).map_err(Error::plain)?;
     json_report.give(
-        || json!(report),
+        || report.clone(),
         || {
             println!(
                 "{} masks of {} instances in {}",

@@ -6,11 +6,13 @@ use std::path::Path;
 use cif_scene::{ObjectMatch, ObjectQuery, known_names};
 use cif_vision::embedding::TextEmbedder;
 use cif_vision::{Models, library};
-use serde_json::json;
+use serde::Serialize;
 
-use super::{Query, point};
+use super::find::{point, search};
+use super::options::Query;
 use crate::error::Error;
 use crate::messages::note;
+use crate::report::JsonReport;
 use crate::words::{self, words};
 
 /// Texts of anything: an object that is nearer to one of them than to the question is no answer. Source: LERF (2023),
@@ -18,12 +20,23 @@ use crate::words::{self, words};
 const ANYTHING: [&str; 4] = ["object", "things", "stuff", "texture"];
 
 /// An object and how well a text describes it.
+#[derive(Serialize)]
 struct Scored {
+    #[serde(flatten)]
     object: ObjectMatch,
     /// Cosine of the angle between embeddings, or the share of the words of the text that the object has.
     score: f64,
     /// True when it is an answer.
     chosen: bool,
+}
+
+/// Objects by how well a text describes them, the best first.
+#[derive(Serialize)]
+#[serde(transparent)]
+struct Ranking<'a>(&'a [Scored]);
+
+impl JsonReport for Ranking<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif query --text"];
 }
 
 pub(super) fn run(command: &Query, text: &str, wanted: ObjectQuery) -> Result<(), Error> {
@@ -33,12 +46,12 @@ pub(super) fn run(command: &Query, text: &str, wanted: ObjectQuery) -> Result<()
             "for example --text 'something to drink from', or --text mug",
         ));
     }
-    // What models lack is told before a stage is read.
+    // Missing models are reported before a stage is read.
     let models = command.models.as_deref().map(Models::open).transpose()?;
     if let Some(models) = &models {
         models.embedder_name()?;
     }
-    let objects = super::search(command, wanted)?;
+    let objects = search(command, wanted)?;
     let has_embeddings = objects.iter().any(|object| object.embedding.is_some());
     let scored = match models {
         Some(models) if has_embeddings => by_meaning(&models, text, objects, &command.path)?,
@@ -125,16 +138,7 @@ fn by_words(text: &str, objects: Vec<ObjectMatch>, place: &Path) -> Result<Vec<S
 }
 
 fn report(command: &Query, scored: &[Scored]) -> Result<(), Error> {
-    let report = || {
-        let one = |one: &Scored| {
-            let mut object = json!(one.object);
-            object["score"] = json!(one.score);
-            object["chosen"] = json!(one.chosen);
-            object
-        };
-        json!(scored.iter().map(one).collect::<Vec<_>>())
-    };
-    command.report.give(report, || print(scored))
+    command.report.give(|| Ranking(scored), || print(scored))
 }
 
 fn print(scored: &[Scored]) {

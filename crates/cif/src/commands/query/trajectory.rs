@@ -5,7 +5,7 @@ use std::path::Path;
 
 use cif_scene::{ObjectQuery, ReadOptions, SceneGraph, SceneOptions, Trajectory, trajectories};
 
-use super::Query;
+use super::options::Query;
 use crate::commands::shared::scene;
 use crate::error::Error;
 use crate::formats::{self, Content};

@@ -8,7 +8,7 @@ use cif_geometry::PixelGrid;
 use cif_render::{InstanceImage, RenderedImage};
 use cif_train::metrics::mask_ids;
 
-use super::What;
+use super::layers::What;
 use crate::camera_file::View;
 use crate::error::Error;
 use crate::output;

@@ -1,10 +1,11 @@
 //! `cif render`: pictures of a scene from captured or new views.
 
 mod files;
+mod layers;
 mod painter;
 
-use std::collections::BTreeSet;
-use std::path::PathBuf;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
 
 use cif_dataset::cryptomatte::BACKGROUND;
 use cif_exr::ColorEncoding;
@@ -20,19 +21,22 @@ use cif_system::memory::Need;
 use cif_train::metrics::image::psnr;
 use cif_train::{Clock, SystemClock};
 use clap::{ArgGroup, Args, ValueEnum};
+use serde::Serialize;
 
-use super::eval::SplitName;
+use super::shared::scene;
+use super::shared::simd::Simd;
+use super::shared::split::SplitName;
 use super::shared::trajectories::Trajectories;
-use super::{Simd, shared::scene};
 use crate::camera_file::{self, FORMAT_HELP, View};
 use crate::commands::shared::{CaptureOptions, print_misfits, print_warnings};
 use crate::error::Error;
 use crate::messages::outcome;
 use crate::moment::Moment;
 use crate::output::Outputs;
-use crate::report::Report;
+use crate::report::{JsonReport, Report};
 use crate::{endings, interrupt, output};
 use files::ViewFiles;
+use layers::What;
 use painter::Painter;
 #[cfg(feature = "wgpu")]
 use painter::Sample;
@@ -62,13 +66,13 @@ pub(super) struct Render {
     /// Folder to write into: DIR/WHAT/VIEW.png
     #[arg(short, long, value_name = "DIR", value_parser = endings::folder())]
     output: PathBuf,
-    /// Layers to write, comma separated [default: rgb, or nothing beside --exr]
+    /// Layers to write, comma separated [default: rgb, or none with --exr]
     #[arg(long, value_delimiter = ',', value_name = "WHAT")]
     what: Vec<What>,
     /// Write DIR/exr/VIEW.exr: beauty, depth, motion, instances and Cryptomatte in one file per view
     #[arg(long)]
     exr: bool,
-    /// Quality of the pictures; what a draft loses is measured on some of the views and told
+    /// Quality of the pictures; the loss of a draft is measured on some of the views and printed
     #[arg(long, value_name = "QUALITY", default_value = "final")]
     quality: QualityName,
     /// Colours of the EXR files
@@ -84,39 +88,11 @@ pub(super) struct Render {
     /// Vector instructions: `auto` takes the widest that the processor has
     #[arg(long, value_name = "LEVEL", default_value = "auto", value_parser = Simd::parser())]
     simd: Simd,
-    /// Backend that renders: `auto` measures the first view where there is a GPU, and tells what is faster. EXR files
+    /// Backend that renders: `auto` measures the first view where there is a GPU, and uses the faster one. EXR files
     /// need the processor
     #[cfg(feature = "wgpu")]
     #[arg(long, value_name = "BACKEND", default_value = "auto")]
     backend: super::backend::Backend,
-}
-
-/// Layers that can be written.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
-pub(super) enum What {
-    /// Colour, 8-bit RGB
-    Rgb,
-    /// Colour with the paths of moving objects over it, the way to come fainter, and the axes of rigid ones (x red, y
-    /// green, z blue) where they are, 8-bit RGB
-    Tracks,
-    /// Mask id of the most probable instance, 16-bit grey, 0 = belongs to none
-    Instance,
-    /// The same in colours, dark where no instance is, 8-bit RGB
-    InstanceColor,
-    /// Expected depth along the viewing axis, 16-bit grey, millimetres for scenes in metres, 0 = none
-    Depth,
-    /// Depth in colours, 8-bit RGB
-    DepthColor,
-    /// Colour coverage, 16-bit grey, 65535 = 1
-    Alpha,
-    /// Probability that the pixel belongs to any instance, 16-bit grey, 65535 = 1
-    Foreground,
-    /// Instance coverage, 16-bit grey, 65535 = 1
-    Coverage,
-    /// Probability of the most probable instance, 16-bit grey, 65535 = 1
-    Probability,
-    /// Entropy of the instance distribution, 16-bit grey, thousandths of a nat
-    Entropy,
 }
 
 /// Care of a render.
@@ -150,29 +126,10 @@ impl From<ExrColor> for ColorEncoding {
 /// Folder of the EXR files inside the output.
 const EXR_FOLDER: &str = "exr";
 
-impl What {
-    /// Folder of the layer inside the output: its name, as it is typed.
-    pub(super) fn folder(self) -> String {
-        self.to_possible_value().map(|value| value.get_name().to_owned()).unwrap_or_default()
-    }
-
-    fn of_instances(self) -> bool {
-        matches!(
-            self,
-            Self::Instance
-                | Self::InstanceColor
-                | Self::Foreground
-                | Self::Coverage
-                | Self::Probability
-                | Self::Entropy
-        )
-    }
-}
-
 fn after_help() -> String {
     format!(
         "Values beyond what 16 bits hold are written as 65535.\n\n\
-         Views are drawn and written in bands of rows, so that their size takes no memory to speak of; only\n\
+         Views are drawn and written in bands of rows, so that large views need little memory; only\n\
          depth-color keeps 4 bytes per pixel.\n\n\
          EXR files hold 32-bit floats: colour multiplied by alpha without the background colour, Z (1e10\n\
          where nothing is), forward.u and .v (pixels to the next view of the same camera, u to the right,\n\
@@ -232,7 +189,7 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     };
     if command.quality == QualityName::Draft {
         let mut renderer = Renderer::new(command.simd.into());
-        tell_draft(&mut renderer, &field, &views, &settings, time_of_all);
+        print_draft_loss(&mut renderer, &field, &views, &settings, time_of_all);
     }
     let field = quality.thin(&field);
     let channels = Channels { depth, instances };
@@ -292,36 +249,67 @@ fn check_memory(views: &[Shot]) -> Result<(), Error> {
     })
 }
 
-/// Views with their times and files.
-fn report(
-    layers: &[String],
-    views: &[Shot],
-    time_of_all: Option<f64>,
-    command: &Render,
+/// Views that were rendered.
+#[derive(Serialize)]
+struct RenderReport<'a> {
+    /// Folder of the files.
+    output: &'a Path,
+    /// Wall time of rendering and writing, seconds.
     seconds: f64,
-) -> Result<serde_json::Value, Error> {
-    let view = |Shot { view, camera }: &Shot| {
+    /// The views.
+    views: Vec<ViewReport<'a>>,
+}
+
+/// A view that was rendered.
+#[derive(Serialize)]
+struct ViewReport<'a> {
+    /// Name, which the files have too.
+    name: &'a str,
+    /// Camera; null where it has no name.
+    camera: Option<&'a str>,
+    /// Time, in [0, 1].
+    time: f64,
+    /// Width, pixels.
+    width: u32,
+    /// Height, pixels.
+    height: u32,
+    /// Files, by the layer that they hold: a value of `--what`, or `exr`.
+    files: BTreeMap<String, String>,
+}
+
+impl JsonReport for RenderReport<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif render"];
+}
+
+/// Views with their times and files.
+fn report<'a>(
+    layers: &[String],
+    views: &'a [Shot],
+    time_of_all: Option<f64>,
+    command: &'a Render,
+    seconds: f64,
+) -> Result<RenderReport<'a>, Error> {
+    let view = |Shot { view, camera }: &'a Shot| {
         let file = |layer: &String| {
             let ending = if layer == EXR_FOLDER { "exr" } else { "png" };
             let path = output::inside(&command.output.join(layer), &view.name, ending)?;
-            Ok((layer.clone(), path.display().to_string().into()))
+            Ok((layer.clone(), path.display().to_string()))
         };
-        let files: serde_json::Map<_, _> = layers.iter().map(file).collect::<Result<_, Error>>()?;
-        Ok(serde_json::json!({
-            "name": view.name,
-            "camera": (!camera.is_empty()).then_some(camera),
-            "time": time_of_all.or(view.time).unwrap_or(0.0),
-            "width": view.camera.width,
-            "height": view.camera.height,
-            "files": files,
-        }))
+        Ok(ViewReport {
+            name: &view.name,
+            camera: (!camera.is_empty()).then_some(camera),
+            time: time_of_all.or(view.time).unwrap_or(0.0),
+            width: view.camera.width,
+            height: view.camera.height,
+            files: layers.iter().map(file).collect::<Result<_, Error>>()?,
+        })
     };
     let views = views.iter().map(view).collect::<Result<Vec<_>, Error>>()?;
-    Ok(serde_json::json!({ "output": command.output, "seconds": seconds, "views": views }))
+    Ok(RenderReport { output: &command.output, seconds, views })
 }
 
 /// Renders some of the views in both qualities and says what the draft loses and gains.
-fn tell_draft(
+fn print_draft_loss(
     renderer: &mut Renderer,
     field: &Field,
     views: &[Shot],
@@ -477,7 +465,7 @@ impl Place<'_> {
     }
 }
 
-/// Renders a view, and writes its EXR file beside the other `files`.
+/// Renders a view, and writes its EXR file next to the other `files`.
 fn write_exr(
     renderer: &mut Renderer,
     channels: Channels,

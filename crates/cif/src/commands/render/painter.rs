@@ -26,7 +26,7 @@ pub(super) enum Painter {
     Gpu(Box<GpuRenderer>),
 }
 
-/// View that is rendered first, to tell which backend is faster.
+/// View that is rendered first, to find the faster backend.
 #[cfg(feature = "wgpu")]
 pub(super) struct Sample<'a> {
     pub(super) field: &'a Field,

@@ -70,7 +70,7 @@ impl<'a> AskedScene<'a> {
         mask_query::find(field, dataset, masks, selection, renderer, settings, interrupt::go_on)
     }
 
-    /// What [`Self::reproject`] found in the view of a frame, where the foreground is at least `gate`.
+    /// Pixels of the answer of [`Self::reproject`] in the view of a frame, where the foreground is at least `gate`.
     pub(in crate::commands) fn reprojected(
         &mut self,
         found: &Found,
@@ -100,7 +100,7 @@ impl<'a> AskedScene<'a> {
         Ok((found, detected.boxes))
     }
 
-    /// What [`Self::group`] found in the view of a frame.
+    /// Pixels of the answer of [`Self::group`] in the view of a frame.
     pub(in crate::commands) fn grouped(&mut self, found: &Found, frame: usize) -> PixelGrid<bool> {
         let Self { field, dataset, settings, renderer } = self;
         let frame = &dataset.frames[frame];

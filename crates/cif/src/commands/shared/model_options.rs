@@ -9,7 +9,7 @@ use clap::{Args, ValueEnum};
 #[derive(Clone, Debug, Args)]
 #[command(next_help_heading = "Motion and colliders")]
 pub(in crate::commands) struct ModelOptions {
-    /// Most expensive motion that may be chosen; what it loses is told
+    /// Most expensive motion model that may be chosen; the loss against richer models is reported
     #[arg(long, default_value = "dense", value_name = "MODEL")]
     motion: Motion,
     /// Most rigid parts of an object, 2 to 64
@@ -18,11 +18,11 @@ pub(in crate::commands) struct ModelOptions {
     /// Write a sample at every frame, also where interpolation would do
     #[arg(long)]
     no_reduce_keys: bool,
-    /// Most convex hulls of an object, 0 for no colliders; more than one pay for concave objects [default: 1, or 0
+    /// Most convex hulls of an object, 0 for no colliders; more than one for concave objects [default: 1, or 0
     /// where the plan that the scene was trained with leaves physics out, see `cif plan`]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=1024))]
     hulls: Option<u16>,
-    /// Most convex hulls of the background, for simulators in which objects fall on it; 16 to 64 do
+    /// Most convex hulls of the background, for simulators in which objects fall on it; 16 to 64 are enough
     #[arg(long, default_value_t = 0, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=1024))]
     background_hulls: u16,
 }

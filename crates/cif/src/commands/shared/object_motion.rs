@@ -15,28 +15,39 @@ pub(in crate::commands) enum ObjectMotion {
     Static,
     /// It moves as one body, by poses over time.
     Rigid {
+        /// Poses.
         poses: usize,
         /// Largest distance of its centre from the first pose, units of the capture.
         moves: f64,
         /// Largest turn from the first pose, degrees.
         turns_deg: f64,
-        /// `None` where nobody told.
+        /// Evidence for its rotation; `None` where none was recorded.
         rotation: Option<RotationEvidence>,
         /// True where it is hidden at some times.
         #[serde(default)]
         hidden: bool,
     },
     /// A base, and parts that joints tie to it.
-    Parts { joints: Vec<JointMotion> },
+    Parts {
+        /// Parts on joints.
+        joints: Vec<JointMotion>,
+    },
     /// Each of its Gaussians follows recorded samples.
-    Dense { samples: usize },
+    Dense {
+        /// Samples.
+        samples: usize,
+    },
     /// The deformation moves so many of its Gaussians.
-    Free { moving: usize },
+    Free {
+        /// Gaussians that it moves.
+        moving: usize,
+    },
 }
 
 /// A part on a joint.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(in crate::commands) struct JointMotion {
+    /// Kind of the joint.
     joint: JointKind,
     /// Unit direction, world.
     axis: [f64; 3],
@@ -44,6 +55,7 @@ pub(in crate::commands) struct JointMotion {
     through: [f64; 3],
     /// Least and largest value: degrees, or units of the capture.
     range: [f64; 2],
+    /// Gaussians of the part.
     gaussians: usize,
 }
 

@@ -7,7 +7,6 @@ use cif_render::RenderSettings;
 use cif_scene::CaptureFrame;
 use cif_train::heads::Decoder;
 
-use crate::commands::query::code_at;
 use crate::error::Error;
 use crate::messages::note;
 use crate::moment::{Frames, Moment, note_fraction};
@@ -31,7 +30,7 @@ fn refuse_folder(path: &Path) -> Result<(), Error> {
     Ok(())
 }
 
-/// Loads a `.cif` file with the head that tells labels of its pixels, where its identity rows do not; a head that tells
+/// Loads a `.cif` file with the head that labels its pixels, where its identity rows do not; a head that tells
 /// none is left out.
 ///
 /// # Errors
@@ -59,7 +58,7 @@ pub(in crate::commands) fn frame(field: &Field) -> Result<CaptureFrame, Error> {
     cif_scene::frame_of(field).map_err(Error::plain)
 }
 
-/// Says where a scene lies in the world of its capture, where that is not at its origin; `notes` tell of formats
+/// Says where a scene lies in the world of its capture, where that is not at its origin; `notes` name formats
 /// whose files do not place it.
 pub(in crate::commands) fn note_frame(frame: &CaptureFrame, notes: impl IntoIterator<Item = &'static str>) {
     if frame.is_identity() {
@@ -95,4 +94,32 @@ pub(in crate::commands) fn time(
     let times = &field.timeline.times;
     let code = Frames::of(field, place).code(flag, moment)?;
     Ok(code_at(&field.time_codes(), times, code))
+}
+
+/// Time code of a normalised time: linear between captured times, which need not be evenly spaced.
+pub(in crate::commands) fn code_at(times: &[f64], codes: &[f64], time: f64) -> f64 {
+    let after = times.partition_point(|captured| *captured <= time);
+    if after == 0 {
+        return codes.first().copied().unwrap_or(0.0);
+    }
+    if after == times.len() {
+        return codes[after - 1];
+    }
+    let fraction = (time - times[after - 1]) / (times[after] - times[after - 1]);
+    codes[after - 1] + fraction * (codes[after] - codes[after - 1])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_between_captured_ones_are_interpolated() {
+        let (times, codes) = ([0.0, 0.25, 1.0], [0.0, 1.0, 2.0]);
+        for (time, code) in [(0.0, 0.0), (0.125, 0.5), (0.25, 1.0), (0.625, 1.5), (1.0, 2.0)] {
+            assert_eq!(code_at(&times, &codes, time), code);
+        }
+        assert_eq!(code_at(&[0.5], &[3.0], 0.0), 3.0);
+        assert_eq!(code_at(&[0.5], &[3.0], 1.0), 3.0);
+    }
 }

@@ -7,3 +7,8 @@ pub(in crate::commands) fn table<'a>(heading: impl IntoIterator<Item = &'a str>)
     table.set_content_arrangement(comfy_table::ContentArrangement::Dynamic);
     table
 }
+
+/// A number with some digits behind the point, or `n/a`.
+pub(in crate::commands) fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or("n/a".to_owned(), |value| format!("{value:.digits$}"))
+}

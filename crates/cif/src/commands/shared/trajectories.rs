@@ -20,7 +20,7 @@ const AT_REST: (f64, f64) = (0.015, 3.0);
 /// Turn below which an object that stays in place is at rest, radians.
 const UNTURNED: f64 = 0.02;
 
-/// Opacity of the way to come.
+/// Opacity of the path after the shown time.
 const TO_COME: f64 = 0.4;
 
 /// Width of lines as a share of the image's height, and the least, pixels.

@@ -27,9 +27,9 @@ const WORTH_USING: f64 = 0.9;
 #[derive(Clone, Debug, Args)]
 #[command(next_help_heading = "Budget and targets")]
 pub(super) struct Goals {
-    /// Train about as long as this, from the start of the command to the saved scene: 90s, 5m, "1h 30m".
-    /// Steps, Gaussians and, where nothing else helps, image size are chosen to fit what a few measured
-    /// steps cost here, and stages end by the clock; so the result depends on the machine
+    /// Train for about this long, from the start of the command to the saved scene: 90s, 5m, "1h 30m".
+    /// Steps, Gaussians and, where nothing else helps, image size are chosen from the cost of a few
+    /// measured steps, and stages end by the clock; so the result depends on the machine
     #[arg(long, value_name = "DURATION", value_parser = humantime::parse_duration,
         conflicts_with_all = ["iterations_coarse", "iterations_fine", "iterations_instance"])]
     budget: Option<Duration>,
@@ -49,7 +49,7 @@ pub(super) struct Goals {
 enum ClockName {
     /// Time that passes
     Wall,
-    /// Processor time divided by threads: what would pass if nothing else ran
+    /// Processor time divided by threads: independent of other load on the machine
     Cpu,
 }
 
@@ -140,7 +140,7 @@ impl Goals {
         let left = left * (1.0 - share_of_fits(config, work));
         let choice = choose(config, &calibration, work, left);
         if !quiet {
-            tell(&budget, &choice, config, calibration.steps);
+            announce(&budget, &choice, config, calibration.steps);
         }
         if choice.expected_s < WORTH_USING * left {
             budget.seconds += choice.expected_s - left;
@@ -212,7 +212,7 @@ impl Goals {
 }
 
 /// Says what the budget buys.
-fn tell(budget: &Budget, choice: &Choice, base: &TrainConfig, measured: usize) {
+fn announce(budget: &Budget, choice: &Choice, base: &TrainConfig, measured: usize) {
     let name = serde_json::to_value(base.preset).unwrap_or_default();
     let name = name.as_str().unwrap_or("standard");
     eprintln!(

@@ -10,13 +10,14 @@ use cif_dataset::{Dataset, Layout};
 use cif_field::Checkpoint;
 use cif_train::plan::Basis;
 use cif_train::{
-    Control, EffectChoice, EffectPlan, HeadName, Outcome, Phase, Phases, Preset, Start, Stop, TrainConfig,
-    TrainError, TrainEvent, Trainer,
+    Control, EffectChoice, EffectPlan, Outcome, Phase, Phases, Preset, Start, Stop, TrainConfig, TrainError,
+    TrainEvent, Trainer,
 };
-use clap::builder::PossibleValue;
 use clap::{Args, ValueEnum};
 
-use super::{Simd, shared::scene};
+use super::shared::named::{HeadArgument, preset};
+use super::shared::scene;
+use super::shared::simd::Simd;
 use crate::commands::shared::{CaptureOptions, command_line, print_warnings};
 use crate::destination::{Destination, Existing};
 use crate::error::Error;
@@ -29,8 +30,8 @@ use budget::{Goals, Timing};
 /// Train a scene on a capture
 #[derive(Debug, Args)]
 #[command(after_help = "\
-Settings come from the preset, then from --effects, then the --config file, then what is typed here; the result is
-written beside the scene as SCENE.train.toml, which --config accepts again.
+Settings come from the preset, then from --effects, then the --config file, then the command line; the result is
+written next to the scene as SCENE.train.toml, which --config accepts again.
 
   cif train captures/table -o table.cif --preset draft
   cif train captures/table -o table.cif --masks masks_tracker --iterations-fine 8000 --seed 3
@@ -41,7 +42,7 @@ Measured: draft on examples/tabletop-mini (60 frames of 128 x 96) takes 41 s on 
 standard on a capture of 256 x 192 took five minutes on two cores and reached 31.1 dB and 99 %; paper is
 not measured. `cif bench accuracy` measures this on your capture and machine.
 
-Other masks or variants on one reconstruction, without training it again (settings that are not typed
+Other masks or variants on one reconstruction, without training it again (settings that are not given
 are those of the scene it comes from):
 
   cif train captures/table -o table.cif --no-masks
@@ -53,18 +54,18 @@ runs all of them; each is described in crates/cif-train/src/heads):
 
   cif train captures/table -o codes.cif --from table.cif --head gaussian-grouping
 
-As good as it gets in a minute and a half, or only as long as it has to:
+The best result in a minute and a half, or training until a target is reached:
 
   cif train captures/table -o table.cif --budget 90s
   cif train captures/table -o table.cif --target-psnr 28 --target-miou 85 --budget 10m
 
-With --resume, a budget is for the rest. SCENE.train.toml then holds the settings that came of it. A budget counts
-everything from the start of the command on; fits of objects that it has no time for are left out, and noted.
+With --resume, a budget is for the rest. SCENE.train.toml then holds the resulting settings. A budget counts
+everything from the start of the command on; fits of objects that do not fit into it are left out, with a note.
 
 Ctrl-C and SIGTERM save and stop, inside fits of objects too, which keep the objects that are done; the same command
-with --resume goes on as if nothing had happened. It does so
-after a power cut as well, from the state saved last: there is one every five minutes and at the end of each stage
-(--checkpoint-seconds). While a run lasts, its scene is locked: another one to the same file is refused.")]
+with --resume continues with the same result. It also does so
+after a power cut, from the last saved state: one is saved every five minutes and at the end of each stage
+(--checkpoint-seconds). During a run its scene is locked: a second run that writes the same file is refused.")]
 pub(super) struct Train {
     /// Folder of the capture
     capture: PathBuf,
@@ -74,11 +75,11 @@ pub(super) struct Train {
     /// Replace an existing scene
     #[arg(long)]
     force: bool,
-    /// Go on where SCENE.cif was interrupted; settings come from it
+    /// Continue the interrupted run of SCENE.cif, with its settings
     #[arg(long, conflicts_with_all = ["force", "preset", "config", "set"], conflicts_with = "settings",
         group = "goes_on")]
     resume: bool,
-    /// Go on although images, masks, cameras, points or labels of the capture have changed since the run began; with
+    /// Continue although images, masks, cameras, points or labels of the capture have changed since the run began; with
     /// --from, although its images have
     #[arg(long, requires = "goes_on")]
     accept_changes: bool,
@@ -105,12 +106,12 @@ pub(super) struct Train {
     /// Named settings: draft, standard or paper [default: standard]
     #[arg(long, value_name = "NAME")]
     preset: Option<String>,
-    /// Settings file; only what differs needs to be in it
+    /// Settings file; it may hold only the settings that differ
     #[arg(long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
     /// Effects: auto (as the capture calls for, see `cif plan`), all (as the preset says) or none, then single
-    /// ones on or off, as in auto,+motion,-instances; typed settings and those of a file win
-    /// [default: auto, and all with the preset paper]
+    /// ones on or off, as in auto,+motion,-instances; settings on the command line or in
+    /// a file override them [default: auto, and all with the preset paper]
     #[arg(long, value_name = "LIST", allow_hyphen_values = true, conflicts_with_all = ["resume", "from"])]
     effects: Option<EffectChoice>,
     /// Motion of an object that need not be found, as in --motion-of 'red mug=rigid': rigid (a pose per time) or
@@ -173,7 +174,7 @@ struct Settings {
     #[arg(long, value_name = "FRACTION")]
     resampling_rate: Option<f64>,
     /// Head that the instance stage trains: the paper's, or that of a system it is compared with; 4d-langsplat learns
-    /// the feature maps of --set head.maps=DIR, and tells no instances
+    /// the feature maps of --set head.maps=DIR, and has no labels of instances
     #[arg(long, value_name = "NAME")]
     head: Option<HeadArgument>,
     /// Switch a part of the method off; may be repeated
@@ -185,43 +186,13 @@ struct Settings {
     /// Steps between evaluations on held-out frames; 0 for never
     #[arg(long, value_name = "N")]
     evaluate_every: Option<u32>,
-    /// Steps between saved states on the way; 0 for never [default: 0]
+    /// Steps between saved states during training; 0 for never [default: 0]
     #[arg(long, value_name = "N")]
     checkpoint_every: Option<u32>,
-    /// Seconds between saved states on the way, of which there is one at the end of each stage as well; 0 for
+    /// Seconds between saved states during training; one is saved at the end of each stage as well; 0 for
     /// neither [default: 300]
     #[arg(long, value_name = "SECONDS")]
     checkpoint_seconds: Option<u32>,
-}
-
-/// A head by its name.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct HeadArgument(HeadName);
-
-impl HeadArgument {
-    const ALL: [Self; HeadName::ALL.len()] = {
-        let mut all = [Self(HeadName::Cif); HeadName::ALL.len()];
-        let mut k = 0;
-        while k < all.len() {
-            all[k] = Self(HeadName::ALL[k]);
-            k += 1;
-        }
-        all
-    };
-
-    pub(super) fn head(self) -> HeadName {
-        self.0
-    }
-}
-
-impl ValueEnum for HeadArgument {
-    fn value_variants<'a>() -> &'a [Self] {
-        &Self::ALL
-    }
-
-    fn to_possible_value(&self) -> Option<PossibleValue> {
-        Some(PossibleValue::new(self.0.name()))
-    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
@@ -322,19 +293,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
             })
         }
     }
-    .map_err(|error| match error {
-        TrainError::Stopped => {
-            Error::Interrupted { message: "interrupted; nothing was saved".to_owned(), help: None }
-        }
-        error @ TrainError::ChangedCapture { .. } => {
-            let again = if command.from.is_some() { "without --from" } else { "again with --force" };
-            Error::failed(
-                format!("{}: {error}", command.from.as_ref().unwrap_or(&command.output).display()),
-                format!("put it back; or train {again}; or go on with what is there now: --accept-changes"),
-            )
-        }
-        error => Error::plain(error),
-    })?;
+    .map_err(|error| not_started(command, error))?;
     trainer.set_simd(command.simd.into());
     trainer.set_debug_validation(command.debug_validation);
     command.goals.apply(&timing, &mut trainer)?;
@@ -345,23 +304,58 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     }
 
     shown(&progress).log_to(command.log.as_deref(), command.resume)?;
+    train(command, &timing, trainer, &mut destination, &progress)
+}
+
+/// Runs a trainer to its end, or until it is stopped, and reports the result.
+fn train(
+    command: &Train,
+    timing: &Timing,
+    mut trainer: Trainer,
+    destination: &mut Destination,
+    progress: &Mutex<Progress>,
+) -> Result<(), Error> {
     interrupt::watch_and_save();
     let mut steps_done = StepCount::default();
-    let outcome = training::run(&mut trainer, Some(&mut destination), &mut |event| {
-        shown(&progress).event(event);
+    let outcome = training::run(&mut trainer, Some(destination), &mut |event| {
+        shown(progress).event(event);
         let enough = command.stop_after.is_some_and(|limit| steps_done.after(event) >= limit);
         if enough { Control::Stop } else { Control::Continue }
     });
-    let logged = shown(&progress).finish(trainer.steps_done(), &trainer.wall_s_by_phase());
+    let logged = shown(progress).finish(trainer.steps_done(), &trainer.wall_s_by_phase());
     let outcome = outcome?;
     if command.goals.changes_steps() && !command.quiet {
-        command.goals.report(&timing, &trainer);
+        command.goals.report(timing, &trainer);
     }
+    announce(command, &trainer, outcome)?;
+    report::give(&command.report, &command.output, outcome)?;
+    logged
+}
+
+/// Reason why a run does not start.
+fn not_started(command: &Train, error: TrainError) -> Error {
+    match error {
+        TrainError::Stopped => {
+            Error::Interrupted { message: "interrupted; nothing was saved".to_owned(), help: None }
+        }
+        error @ TrainError::ChangedCapture { .. } => {
+            let again = if command.from.is_some() { "without --from" } else { "again with --force" };
+            Error::failed(
+                format!("{}: {error}", command.from.as_ref().unwrap_or(&command.output).display()),
+                format!("restore it, train {again}, or continue with the changes: --accept-changes"),
+            )
+        }
+        error => Error::plain(error),
+    }
+}
+
+/// Says what became of a run; an error where it was interrupted.
+fn announce(command: &Train, trainer: &Trainer, outcome: Outcome) -> Result<(), Error> {
     let saved = command.output.display();
     match outcome {
         Outcome::Finished => crate::messages::outcome!("saved {saved}"),
         Outcome::Interrupted => {
-            let help = format!("go on with: {}", resume_command(command));
+            let help = format!("continue with: {}", resume_command(command));
             if !trainer.has_begun() {
                 let message = "interrupted before the first step; nothing was saved".to_owned();
                 return Err(Error::Interrupted { message, help: None });
@@ -375,8 +369,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
             crate::messages::outcome!("stopped; saved {saved}; {help}");
         }
     }
-    report::give(&command.report, &command.output, outcome)?;
-    logged
+    Ok(())
 }
 
 /// The progress of the run, for one event.
@@ -561,7 +554,7 @@ fn resolve(
         layers.typed("--ablate", "instance.ablate", names)?;
     }
     if !command.motion_of.is_empty() {
-        let mut told = toml::Table::new();
+        let mut motions = toml::Table::new();
         for assignment in &command.motion_of {
             let Some((label, motion)) = assignment.rsplit_once('=') else {
                 return Err(Error::usage(
@@ -569,20 +562,14 @@ fn resolve(
                     "for example --motion-of 'red mug=rigid'; motions: rigid, free",
                 ));
             };
-            told.insert(label.trim().to_owned(), motion.trim().into());
+            motions.insert(label.trim().to_owned(), motion.trim().into());
         }
-        layers.typed("--motion-of", "motion.of", told)?;
+        layers.typed("--motion-of", "motion.of", motions)?;
     }
     for assignment in &command.set {
         layers.assignment(assignment)?;
     }
     layers.validated()
-}
-
-pub(super) fn preset(name: &str, place: &str) -> Result<Preset, Error> {
-    serde_json::from_value(serde_json::Value::String(name.to_owned())).map_err(|_| {
-        Error::failed(format!("{place}: there is no preset `{name}`"), "presets: draft, standard, paper")
-    })
 }
 
 /// The preset that a settings file starts from; other problems of the file are found when it is applied.

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use cif_bench::comparison::queries::{Answer, Answers, Queries, Way};
+use cif_bench::comparison::queries::{Answer, Answers, Queries, Rule};
 use cif_bench::comparison::record::{Record, Row};
 use cif_bench::comparison::tables::Missing;
 use cif_bench::records::{Kept, Records};
@@ -17,7 +17,7 @@ use cif_train::metrics::{EvaluationOptions, evaluate, mask_ids};
 use cif_vision::grounding::Thresholds;
 use cif_vision::{Models, Prompter};
 
-use super::Capture;
+use super::capture::Capture;
 use super::questions::{OfOneCapture, Question};
 use super::runs::{Bench, Ended, id};
 use crate::commands::shared::asked::{self, AskedScene};
@@ -68,7 +68,7 @@ pub(super) fn ask(
             let heading = format!("{}, seed {}: {}", row.capture, row.seed, row.head);
             match kept.find(&name, &fingerprint) {
                 Kept::Good(known) => {
-                    bench.show(&format!("{heading}: questions: kept, {}", told(&known.answers)), true);
+                    bench.show(&format!("{heading}: questions: kept, {}", summary(&known.answers)), true);
                     queries.answers.extend(known.answers);
                     continue;
                 }
@@ -78,9 +78,9 @@ pub(super) fn ask(
             let answers = match bench.begins() {
                 true => {
                     let asked = Asked { capture, row, questions: &of.questions, detector: detector.as_ref() };
-                    let tell =
+                    let progress =
                         &|done: u64| bench.show_share(&heading, "questions", done, of.questions.len() as u64);
-                    match asked.answers(&bench.runs.file(&format!("{name}.cif")), tell) {
+                    match asked.answers(&bench.runs.file(&format!("{name}.cif")), progress) {
                         Err(Error::Interrupted { .. }) => None,
                         answers => Some(answers?),
                     }
@@ -93,7 +93,7 @@ pub(super) fn ask(
                 queries.missing.push(Missing { capture, head, seed: row.seed });
                 continue;
             };
-            bench.show(&format!("{heading}: questions: {}", told(&answers)), true);
+            bench.show(&format!("{heading}: questions: {}", summary(&answers)), true);
             let answers = Answers { fingerprint, answers };
             kept.keep(&name, &answers)?;
             queries.answers.extend(answers.answers);
@@ -128,7 +128,7 @@ struct Asked<'a> {
 
 impl Asked<'_> {
     /// Answers to all questions, by labels and, with models, by both protocols of masks.
-    fn answers(&self, scene: &Path, tell: &dyn Fn(u64)) -> Result<Vec<Answer>, Error> {
+    fn answers(&self, scene: &Path, progress: &dyn Fn(u64)) -> Result<Vec<Answer>, Error> {
         if self.row.head == HeadName::LangSplat.name() {
             return self.by_relevance(scene);
         }
@@ -138,14 +138,14 @@ impl Asked<'_> {
             let mut scene = AskedScene::new(&field, &self.capture.dataset);
             let trained = self.capture.dataset.train_frames();
             for (done, question) in self.questions.iter().enumerate() {
-                tell(done as u64);
+                progress(done as u64);
                 let detected = scene.detect(detector, &question.text, &trained)?;
                 let found = scene.reproject(&detected.masks, Selection::Instance)?;
                 let scores = self.compare(question, |frame| scene.reprojected(&found, GATE, frame))?;
-                answers.push(self.answer(question, Way::Reproject, chosen(&found), &scores));
+                answers.push(self.answer(question, Rule::Reproject, chosen(&found), &scores));
                 let (found, _) = scene.group(detector, &question.text)?;
                 let scores = self.compare(question, |frame| scene.grouped(&found, frame))?;
-                answers.push(self.answer(question, Way::Grouping, chosen(&found), &scores));
+                answers.push(self.answer(question, Rule::Grouping, chosen(&found), &scores));
             }
         }
         let place = |answer: &Answer| self.questions.iter().position(|asked| asked.text == answer.question);
@@ -174,7 +174,7 @@ impl Asked<'_> {
         })?;
         let answered = self.questions.iter().zip(chosen).zip(frames);
         let answer = |((question, chosen), frames): ((&Question, BTreeSet<u16>), _)| {
-            self.answer(question, Way::Labels, chosen, &agreement(frames))
+            self.answer(question, Rule::Labels, chosen, &agreement(frames))
         };
         Ok(answered.map(answer).collect())
     }
@@ -199,7 +199,7 @@ impl Asked<'_> {
             }
         }
         let answer =
-            |(question, frames)| self.answer(question, Way::Relevance, BTreeSet::new(), &agreement(frames));
+            |(question, frames)| self.answer(question, Rule::Relevance, BTreeSet::new(), &agreement(frames));
         Ok(self.questions.iter().zip(frames).map(answer).collect())
     }
 
@@ -220,7 +220,7 @@ impl Asked<'_> {
         Ok(agreement(frames))
     }
 
-    fn answer(&self, question: &Question, by: Way, chosen: BTreeSet<u16>, scores: &Agreement) -> Answer {
+    fn answer(&self, question: &Question, by: Rule, chosen: BTreeSet<u16>, scores: &Agreement) -> Answer {
         Answer {
             capture: self.row.capture.clone(),
             head: self.row.head.clone(),
@@ -256,13 +256,13 @@ fn chosen(found: &Found) -> BTreeSet<u16> {
 }
 
 /// Answers in a line.
-fn told(answers: &[Answer]) -> String {
-    let of_way = |way: Way| {
+fn summary(answers: &[Answer]) -> String {
+    let of_rule = |rule: Rule| {
         let scores: Vec<f64> =
-            answers.iter().filter(|answer| answer.by == way).filter_map(|answer| answer.miou).collect();
+            answers.iter().filter(|answer| answer.by == rule).filter_map(|answer| answer.miou).collect();
         let mean = scores.iter().sum::<f64>() / scores.len() as f64;
-        (!scores.is_empty()).then(|| format!("mIoU {mean:.2} % by {}", way.name()))
+        (!scores.is_empty()).then(|| format!("mIoU {mean:.2} % by {}", rule.name()))
     };
-    let ways: Vec<String> = Way::ALL.into_iter().filter_map(of_way).collect();
-    if ways.is_empty() { "no held-out frame shows an answer".to_owned() } else { ways.join(", ") }
+    let rules: Vec<String> = Rule::ALL.into_iter().filter_map(of_rule).collect();
+    if rules.is_empty() { "no held-out frame shows an answer".to_owned() } else { rules.join(", ") }
 }

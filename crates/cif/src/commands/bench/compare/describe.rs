@@ -6,8 +6,9 @@ use cif_bench::comparison::page::{Comparison, Video};
 use cif_dataset::Split;
 use cif_train::{HeadName, Trainer};
 
+use super::capture::Capture;
+use super::options::{BenchCompare, Iterations};
 use super::runs::{Bench, empty};
-use super::{BenchCompare, Capture, Iterations};
 
 /// Description of a comparison for its page.
 pub(super) fn describe(

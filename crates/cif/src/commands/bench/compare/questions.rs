@@ -8,7 +8,7 @@ use cif_dataset::meant::known_names;
 use cif_train::heads::lang_splat::relevance::Question as Codes;
 use serde::{Deserialize, Serialize};
 
-use super::Capture;
+use super::capture::Capture;
 use crate::error::Error;
 use crate::words::words;
 
@@ -133,7 +133,7 @@ impl File {
             let name = &of.name;
             if self.content.capture[..k].iter().any(|other| other.name == *name) {
                 return Err(self.refused(
-                    format!("capture {name} is there twice"),
+                    format!("capture {name} is listed twice"),
                     "put all of its questions under one [[capture]]",
                 ));
             }
@@ -322,7 +322,7 @@ mod tests {
         let question = |text: &str, answer: &str| {
             format!("[[capture]]\nname = \"a\"\n[[capture.question]]\ntext = \"{text}\"\nanswer = {answer}\n")
         };
-        for (text, told) in [
+        for (text, message) in [
             (question("jug", "[3.5]"), ["questions.toml:5", "ids of instances"]),
             (question("jug", "[70000]"), ["questions.toml:5", "ids of instances"]),
             (question("jug", "[]"), ["capture a", "has no answer"]),
@@ -337,7 +337,7 @@ mod tests {
             ("[[capture]]\nname = \"a\"\nquestion = []\n".to_owned(), ["capture a", "no questions"]),
         ] {
             let error = read("questions.toml", &text).unwrap_err();
-            assert!(told.iter().all(|part| error.contains(part)), "{error}");
+            assert!(message.iter().all(|part| error.contains(part)), "{error}");
         }
         let error = read("q.json", "{\n \"capture\": [{ \"nam\": 1 }]\n}").unwrap_err();
         assert!(error.contains("q.json:2") && error.contains("nam"), "{error}");
@@ -354,7 +354,10 @@ mod tests {
             Ok(vec![3, 5, 9])
         );
         assert_eq!(of(&[Named::Label("mug".into()), Named::Id(3)]), Ok(vec![3, 5]), "named twice");
-        let told = of(&[Named::Id(4)]).unwrap_err();
-        assert!(told.contains("no instance is 4") && told.contains("3 red mug, 5 blue mug"), "{told}");
+        let message = of(&[Named::Id(4)]).unwrap_err();
+        assert!(
+            message.contains("no instance is 4") && message.contains("3 red mug, 5 blue mug"),
+            "{message}"
+        );
     }
 }

@@ -15,8 +15,8 @@ use cif_geometry::PixelGrid;
 use cif_train::metrics::FrameView;
 use cif_train::{HeadName, Stop, TrainConfig};
 
-use super::Iterations;
-use crate::commands::eval::number;
+use super::options::Iterations;
+use crate::commands::shared::table::number;
 use crate::error::Error;
 use crate::interrupt;
 use crate::pictures::{Picture, instance_picture, rgb_picture};
@@ -81,7 +81,7 @@ impl Bench {
             }
             match self.runs.find(&id, &fingerprint) {
                 Kept::Good(record) => {
-                    self.show(&format!("{heading}: {}: kept, {}", contender.name(), told(&record)), true);
+                    self.show(&format!("{heading}: {}: kept, {}", contender.name(), summary(&record)), true);
                     self.records.push(record);
                     continue;
                 }
@@ -91,15 +91,16 @@ impl Bench {
                 Kept::Missing => {}
             }
             if base.is_none() && self.begins() {
-                let tell = &mut |done, whole| self.show_share(&heading, "reconstruction", done, whole);
-                base = subject.reconstruct(&self.runs, &stop, tell)?;
+                let progress = &mut |done, whole| self.show_share(&heading, "reconstruction", done, whole);
+                base = subject.reconstruct(&self.runs, &stop, progress)?;
                 self.ended = base.is_none().then_some(Ended::Interrupted);
             }
             let trained = match base.as_ref().filter(|_| self.begins()) {
                 Some(base) => {
-                    let tell: &mut dyn FnMut(u64, u64) =
+                    let progress: &mut dyn FnMut(u64, u64) =
                         &mut |done, whole| self.show_share(&heading, contender.name(), done, whole);
-                    let trained = subject.train(&self.runs, (&id, &config), base, &stop, (tell, &draw))?;
+                    let trained =
+                        subject.train(&self.runs, (&id, &config), base, &stop, (progress, &draw))?;
                     if trained.is_none() {
                         self.ended = Some(Ended::Interrupted);
                     }
@@ -118,7 +119,7 @@ impl Bench {
             record.fingerprint = fingerprint;
             record.row.head = contender.name().to_owned();
             self.runs.keep(&id, &record)?;
-            self.show(&format!("{heading}: {}: {}", contender.name(), told(&record)), true);
+            self.show(&format!("{heading}: {}: {}", contender.name(), summary(&record)), true);
             self.records.push(record);
         }
         Ok(())
@@ -201,7 +202,7 @@ fn draw(view: &FrameView<'_>) -> Vec<(&'static str, Picture)> {
 }
 
 /// A record in a line.
-fn told(record: &Record) -> String {
+fn summary(record: &Record) -> String {
     let row = &record.row;
     format!(
         "PQ {} %, IoU {} %, mAcc-pix {} %, mIoU {} %, {} dB, {} Gaussians, {:.1} s",

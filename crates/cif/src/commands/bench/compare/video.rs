@@ -18,7 +18,7 @@ use cif_train::HeadName;
 use cif_train::heads::Decoder;
 use cif_train::metrics::mask_ids;
 
-use super::Capture;
+use super::capture::Capture;
 use super::runs::{Bench, id, labels};
 use crate::commands::shared::scene;
 use crate::error::Error;
@@ -74,11 +74,11 @@ pub(super) fn write_all(folder: &Path, bench: &Bench, captures: &[Capture]) -> R
             })
             .collect::<Result<Vec<_>, Error>>()?;
         let file = folder.join(format!("{}.mp4", capture.name));
-        let tell = |done: usize| {
+        let progress = |done: usize| {
             let percent = 100 * done / path.len();
             bench.show(&format!("{}: video: {percent} %", capture.name), false);
         };
-        encode(OsStr::new(ENCODER), &file, &shown, &path, tell)?;
+        encode(OsStr::new(ENCODER), &file, &shown, &path, progress)?;
         bench.show(&format!("{}: wrote {}", capture.name, file.display()), true);
         let titles = records.iter().map(|record| title(&record.row.head, &capture.config.head.camera));
         videos.push(Video {
@@ -151,7 +151,7 @@ fn encode(
     file: &Path,
     shown: &[Shown],
     path: &[(PinholeCamera, f64)],
-    tell: impl Fn(usize),
+    progress: impl Fn(usize),
 ) -> Result<(), Error> {
     let folder = file.parent().unwrap_or(Path::new("."));
     let scratch = Scratch::inside(folder).map_err(Error::io("write into", folder))?;
@@ -166,7 +166,7 @@ fn encode(
             }
             return Err(interrupted);
         }
-        tell(done);
+        progress(done);
         let camera = camera.resized(
             camera.width.min(PART_WIDTH),
             (camera.height * camera.width.min(PART_WIDTH)).div_ceil(camera.width.max(1)),
@@ -177,7 +177,7 @@ fn encode(
             None => encoder.insert(start(program, &picture, &partial)?),
         };
         let bytes: Vec<u8> = picture.pixels.iter().flatten().copied().collect();
-        // An encoder that has gone tells why when it is waited for.
+        // An encoder that has ended gives its reason when it is waited for.
         if child.stdin.as_mut().is_none_or(|input| input.write_all(&bytes).is_err()) {
             break;
         }

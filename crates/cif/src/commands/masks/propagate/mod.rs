@@ -6,13 +6,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use cif_dataset::masks::MaskWriter;
-use cif_dataset::{Dataset, OpenOptions, Split};
+use cif_dataset::{Dataset, InstanceLabel, OpenOptions, Split};
 use cif_geometry::PixelGrid;
 use cif_masks::rig::{self, View};
 use cif_masks::suggest::{Camera, Propagated, doubt, next_frame};
 use cif_masks::{Clip, Keyframe, Mask};
 use clap::Args;
-use serde_json::json;
+use serde::Serialize;
 
 use self::points::Points;
 use crate::commands::shared::{FrameOptions, LayoutName, command_line};
@@ -20,8 +20,9 @@ use crate::error::Error;
 use crate::interrupt;
 use crate::pictures::{ContactSheet, save_jpeg};
 use crate::progress::FrameProgress;
+use crate::report::JsonReport;
 
-/// Name of the picture of frames beside their masks, in the folder of masks. Not PNG, so that it is no mask.
+/// Name of the picture of frames next to their masks, in the folder of masks. Not PNG, so that it is no mask.
 const SHEET: &str = "contact_sheet.jpg";
 
 /// Every so many frames one is on the picture.
@@ -30,21 +31,21 @@ const SHEET_EVERY: usize = 10;
 /// Background behind images with alpha.
 const BACKGROUND: [f32; 3] = [1.0; 3];
 
-/// Make the masks of all frames out of a few painted ones
+/// Make the masks of all frames from a few painted ones
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Keyframes are PNG files of ids, 0 for unlabelled, named as the frames that they show (000012.png, cam03/0007.png).
 Paint every object in the first and the last frame and in a few between, at best one frame after every change: an
-object that enters, a hand that leaves. Ids are brought along by optical flow from the keyframes before and after, and
-checked by what pixels look like. Cameras without a keyframe get theirs from the others by points in the world: those
-of the capture, or of a first scene (--scene), which also knows how they move.
+object that enters, a hand that leaves. Ids are propagated by optical flow from the keyframes before and after, and
+checked by appearance. Cameras without a keyframe get their ids from the others through points in the world: those
+of the capture, or of a first scene (--scene), which also has their motion.
 
   cif masks propagate captures/table --keyframes painted -o table-masks
   cif train captures/table --masks table-masks -o table.cif
 
 The output folder holds a PNG of ids per frame, instances.json, confidence/FRAME.png (8-bit grey: probability that
 the id is right, 255 for certain; training takes pixels below 192 as unlabelled) and contact_sheet.jpg, every tenth
-frame beside its mask. Results do not depend on the number of threads.")]
+frame next to its mask. Results do not depend on the number of threads.")]
 pub(super) struct Propagate {
     /// Folder of the capture
     capture: PathBuf,
@@ -69,7 +70,7 @@ pub(super) struct Propagate {
     report: crate::report::OnlyReport,
     #[arg(from_global)]
     quiet: bool,
-    /// A step of `cif make`, which tells what comes next
+    /// A step of `cif make`, which prints the next step itself
     #[arg(long, hide = true)]
     step: bool,
 }
@@ -132,7 +133,7 @@ pub(super) fn run(command: &Propagate) -> Result<(), Error> {
     work.finish(command, &cameras)
 }
 
-/// Opens the capture with the keyframes as its masks, and tells what is wrong with them.
+/// Opens the capture with the keyframes as its masks, and reports what is wrong with them.
 fn open(command: &Propagate) -> Result<Dataset, Error> {
     let folder = &command.keyframes;
     if !folder.is_dir() {
@@ -318,21 +319,42 @@ impl Work<'_> {
         let names = |frames: &[usize]| -> Vec<&str> {
             frames.iter().map(|frame| dataset.frames[*frame].name.as_str()).collect()
         };
-        let report = || {
-            json!({
-                "masks_in": command.output,
-                "masks": masks,
-                "instances": dataset.instances,
-                "keyframes": names(&painted.keys().copied().collect::<Vec<_>>()),
-                "frames_without_mask": names(&unmasked),
-                "label_next": next.map(|frame| &dataset.frames[frame].name),
-                "doubt_there": next.map(|frame| doubts[frame]),
-            })
+        let report = || PropagateReport {
+            masks_in: &command.output,
+            masks,
+            instances: &dataset.instances,
+            keyframes: names(&painted.keys().copied().collect::<Vec<_>>()),
+            frames_without_mask: names(&unmasked),
+            label_next: next.map(|frame| dataset.frames[frame].name.as_str()),
+            doubt_there: next.map(|frame| doubts[frame]),
         };
         command.report.give(report, || {
             self::print(command, dataset, masks, painted.len(), next.map(|frame| (frame, doubts[frame])))
         })
     }
+}
+
+/// Masks that were made from keyframes.
+#[derive(Serialize)]
+struct PropagateReport<'a> {
+    /// Folder of the masks.
+    masks_in: &'a Path,
+    /// Masks.
+    masks: usize,
+    /// Instances of the masks.
+    instances: &'a [InstanceLabel],
+    /// Names of the frames that were painted.
+    keyframes: Vec<&'a str>,
+    /// Names of the frames that got no mask.
+    frames_without_mask: Vec<&'a str>,
+    /// Name of the frame that is best painted next; null where none is in doubt.
+    label_next: Option<&'a str>,
+    /// Share of that frame whose labels are in doubt, in [0, 1].
+    doubt_there: Option<f64>,
+}
+
+impl JsonReport for PropagateReport<'_> {
+    const COMMANDS: &'static [&'static str] = &["cif masks propagate"];
 }
 
 /// Prints what was made, and what comes next.

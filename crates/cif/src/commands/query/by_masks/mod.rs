@@ -2,143 +2,24 @@
 
 mod report;
 
-use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use cif_dataset::masks::found_masks;
 use cif_dataset::{Dataset, Split};
 use cif_geometry::PixelGrid;
-use cif_vision::grounding::FoundBox;
-use clap::{Args, ValueEnum};
 
-use super::Query;
+use self::report::Answer;
+use super::mask_options::{ByMasks, Protocol, Select};
+use super::options::Query;
 use crate::commands::shared::asked::{self, AskedScene};
 use crate::commands::shared::scene;
-use crate::commands::shared::{CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings};
+use crate::commands::shared::{CaptureOptions, print_misfits, print_warnings};
 use crate::detector::Detector;
 use crate::error::Error;
 use crate::formats;
-use crate::mask_query::{Agreement, Found, FoundMasks, FrameAgreement, GATE, Selection, agreement};
+use crate::mask_query::{Agreement, FoundMasks, FrameAgreement, GATE, agreement};
 use crate::pictures::save_grey;
-use crate::{endings, interrupt, output};
-
-/// Masks that a detector found, and their use.
-#[derive(Debug, Args)]
-#[command(next_help_heading = "By masks")]
-pub(super) struct ByMasks {
-    /// Folder of what a detector found on frames of the capture
-    #[arg(
-        long,
-        value_name = "DIR",
-        requires = "capture",
-        conflicts_with_all = ["label", "taxonomy", "point", "region", "time", "interval", "prompt"]
-    )]
-    masks: Option<PathBuf>,
-    /// Words for the detector
-    #[arg(
-        long,
-        value_name = "TEXT",
-        requires = "capture",
-        conflicts_with_all = ["label", "taxonomy", "point", "region", "time", "interval", "text"]
-    )]
-    prompt: Option<String>,
-    /// Command that reads the frames in {frames} and writes the masks of {prompt} into {masks}; without
-    /// these words the folder of frames, the folder of masks and the prompt are its last arguments
-    #[arg(long, value_name = "CMD", requires = "prompt", conflicts_with = "models")]
-    detector: Option<String>,
-    /// Keep the masks that models make in this folder, for the next time [default: .cif-cache in the capture]
-    #[arg(long, value_name = "DIR", requires = "prompt", requires = "models")]
-    cache: Option<PathBuf>,
-    /// Rule by which instances are chosen
-    #[arg(long, value_name = "RULE", default_value = "reproject")]
-    protocol: Protocol,
-    /// Capture that the masks belong to
-    #[arg(long, value_name = "CAPTURE")]
-    capture: Option<PathBuf>,
-    /// Gaussians that make up the result
-    #[arg(long, value_name = "SET", default_value = "instance")]
-    select: Select,
-    /// Least foreground of a pixel of the rendered masks, 0 to 1: below it a pixel is background. The paper has no
-    /// such gate (0) [default: 0.5]
-    #[arg(long, value_name = "SHARE", value_parser = share, requires = "eval")]
-    foreground: Option<f32>,
-    /// Render the result from held-out frames and compare it with the masks there
-    #[arg(long, requires = "capture")]
-    eval: bool,
-    /// Write the rendered masks of --eval into this folder
-    #[arg(short, long, value_name = "DIR", requires = "eval", value_parser = endings::folder())]
-    output: Option<PathBuf>,
-    /// Reduce images by 1, 2, 4, ... [default: as the scene was trained]
-    #[arg(long, value_name = "FACTOR", value_parser = clap::value_parser!(u32).range(1..=64))]
-    downscale: Option<u32>,
-    /// Read the capture as this layout where two fit
-    #[arg(long, value_name = "LAYOUT")]
-    layout: Option<LayoutName>,
-    #[command(flatten)]
-    frames: FrameOptions,
-}
-
-/// Which Gaussians make up the result.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum Select {
-    /// Those of the chosen instances
-    Instance,
-    /// Those inside the masks themselves
-    Gaussian,
-    /// Those that are both: a part of an instance
-    Both,
-}
-
-/// Rule by which instances are chosen.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum Protocol {
-    /// Those that lie mostly inside the masks of the training frames
-    Reproject,
-    /// Those with more than 0.7 of their pixels inside the mask of the first held-out view as it is rendered; their
-    /// answer in a view are the pixels with a probability above 0.2, as in Gaussian Grouping
-    Grouping,
-}
-
-impl Protocol {
-    /// As it is typed.
-    fn name(self) -> &'static str {
-        match self {
-            Self::Reproject => "reproject",
-            Self::Grouping => "grouping",
-        }
-    }
-}
-
-impl From<Select> for Selection {
-    fn from(select: Select) -> Self {
-        match select {
-            Select::Instance => Self::Instance,
-            Select::Gaussian => Self::Gaussian,
-            Select::Both => Self::Both,
-        }
-    }
-}
-
-impl ByMasks {
-    /// True when the question is asked by masks.
-    pub(super) fn is_asked(&self) -> bool {
-        self.masks.is_some() || self.prompt.is_some()
-    }
-}
-
-/// A number in [0, 1].
-fn share(text: &str) -> Result<f32, String> {
-    let share: f32 = text.parse().map_err(|_| "expected a number".to_owned())?;
-    if (0.0..=1.0).contains(&share) { Ok(share) } else { Err("expected 0 to 1".to_owned()) }
-}
-
-/// Answer to a question by masks.
-struct Answer {
-    found: Found,
-    /// Boxes of the prompt in the pictures that chose, by frame.
-    boxes: BTreeMap<String, Vec<FoundBox>>,
-    scores: Option<Agreement>,
-}
+use crate::{interrupt, output};
 
 /// Origin of the masks.
 enum Source<'a> {

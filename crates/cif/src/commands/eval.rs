@@ -1,16 +1,16 @@
 //! `cif eval`: scores a scene on the held-out frames of a capture.
 
-pub(super) mod motion;
-
 use std::path::PathBuf;
 
-use cif_dataset::Split;
 use cif_field::Field;
 use cif_train::heads::Decoder;
 use cif_train::metrics::{Evaluation, EvaluationError, EvaluationOptions, FrameView, evaluate};
-use clap::{Args, ValueEnum};
+use clap::Args;
 
-use super::{Simd, shared::scene};
+use super::shared::simd::Simd;
+use super::shared::split::SplitName;
+use super::shared::table::number;
+use super::shared::{motion, scene};
 use crate::commands::shared::{CaptureOptions, print_misfits, print_warnings};
 use crate::error::Error;
 use crate::evaluation::{label_of, report_of};
@@ -26,12 +26,12 @@ use crate::{endings, interrupt, output};
 #[derive(Debug, Args)]
 #[command(after_help = "\
 PSNR and SSIM are means over images (SSIM: 11 x 11 window, zero padding). The co-visible PSNR is that of
-the pixels, seen so many percent of all, whose place training views show too: their point, at the depth that
-the scene renders, lies inside a tenth of the training views (at least 5; 64 are asked where there are more)
-and at most 5 % behind what the scene renders there. It leaves out what no training image shows.
+the pixels whose surface training views show too (their share of all pixels is shown): their point, at the rendered
+depth, lies inside a tenth of the training views (at least 5, out of 64 where there are more)
+and at most 5 % behind the depth rendered there. It leaves out parts that no training image shows.
 
-Instance scores are percent. PQ and IoU take pixels without a label as background, so that what an object spills onto
-it counts: PQ is panoptic quality (Kirillov et al. 2019), IoU the mean over pairs of instance and frame. Where masks
+Instance scores are percent. PQ and IoU take pixels without a label as background, so that splats that spill onto
+it count: PQ is panoptic quality (Kirillov et al. 2019), IoU the mean over pairs of instance and frame. Where masks
 leave objects unlabelled, these are too low. The paper's protocol looks at labelled pixels alone: mAcc-pix per frame,
 mAcc-inst per instance, mIoU per pair of instance and frame. A scene of another head (`cif train --head`) is scored by what that head decodes per pixel
 (JSON: labels_by). The JSON also has the other definitions in use, and values per frame and per instance.
@@ -74,22 +74,6 @@ pub(super) struct Eval {
     simd: Simd,
 }
 
-/// Splits by name.
-#[derive(Clone, Copy, Debug, ValueEnum)]
-pub(super) enum SplitName {
-    Train,
-    Val,
-}
-
-impl From<SplitName> for Split {
-    fn from(name: SplitName) -> Self {
-        match name {
-            SplitName::Train => Self::Train,
-            SplitName::Val => Self::Val,
-        }
-    }
-}
-
 pub(super) fn run(command: &Eval) -> Result<(), Error> {
     let mut outputs = Outputs::new(command.force);
     outputs.reads(&command.scene)?;
@@ -103,7 +87,7 @@ pub(super) fn run(command: &Eval) -> Result<(), Error> {
     for file in dataset.motion_files().iter().flatten() {
         outputs.reads(file)?;
     }
-    // Read first: damaged files are told before frames are rendered.
+    // Read first: damaged files are reported before frames are rendered.
     let truth = dataset.motion_truth().map_err(Error::plain)?;
     print_misfits(&field, &dataset, command.split.into());
     if let Some(folder) = &command.images {
@@ -225,8 +209,4 @@ fn print_table(evaluation: &Evaluation, field: &Field) {
         );
     }
     println!("{} Gaussians, {:.1} ms per frame", evaluation.gaussians, evaluation.render_ms_per_frame);
-}
-
-pub(super) fn number(value: Option<f64>, digits: usize) -> String {
-    value.map_or("n/a".to_owned(), |value| format!("{value:.digits$}"))
 }

@@ -1,10 +1,10 @@
-//! Motion in `cif eval`: the scene graph as `cif export` would write it, against followed points.
+//! Motion of a scene, measured: the scene graph as `cif export` would write it, against followed points.
 
 use cif_dataset::{Dataset, MotionTruth};
 use cif_field::Field;
 use cif_scene::motion_scores::MotionErrors;
 
-use super::number;
+use super::table::number;
 use crate::error::Error;
 use crate::evaluation::{Motion, motion_of};
 
