@@ -123,6 +123,25 @@ fn arrays_of_truth_values_show_one_object() {
 }
 
 #[test]
+fn classes_of_grounded_sam_2_lie_beside_its_arrays() {
+    let folder = hypernerf(2);
+    let source = folder.path().join("tracked");
+    for frame in 0..2 {
+        let mut bytes = npy_header("<u2", &format!("({HEIGHT}, {WIDTH})"));
+        bytes.extend((0..WIDTH * HEIGHT).flat_map(|at| (object_at(at % WIDTH) as u16).to_le_bytes()));
+        write(&source.join(format!("mask_data/mask_{frame:06}.npy")), bytes);
+        let class =
+            |id: u16, name: &str| json!({"instance_id": id, "class_name": name, "x1": 0, "logit": 0.0});
+        let labels = json!({"1": class(1, "cup"), "2": class(2, "")});
+        let told = json!({"mask_name": format!("mask_{frame:06}.npy"), "labels": labels});
+        write_json(&source.join(format!("json_data/mask_{frame:06}.json")), &told);
+    }
+    let (kind, labels, frames) = imported(&folder, &source);
+    assert_eq!((kind, labels), (SourceKind::Arrays, vec!["cup".to_owned(), "instance_2".to_owned()]));
+    assert_eq!(frames, [BOTH; 2]);
+}
+
+#[test]
 fn files_without_masks_say_what_they_hold() {
     let folder = hypernerf(1);
     let path = folder.path().join("annotations.xml");

@@ -1,13 +1,16 @@
-//! NumPy arrays of ids: a file per frame (`[height, width]`), or one for all (`[frames, height, width]`).
+//! NumPy arrays of ids: a file per frame (`[height, width]`), or one for all (`[frames, height, width]`). Grounded SAM 2
+//! writes them in `mask_data`, and the classes of ids in JSON files of the same names in `json_data` beside it.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use serde::Deserialize;
+
 use super::files_below::files_below;
 use super::picture::{Content, Listing, Picture, Place};
 use crate::Error;
-use crate::files::{listing, npy};
+use crate::files::{json, listing, npy};
 
 /// Endings of arrays.
 pub(super) const ENDINGS: [&str; 2] = ["npy", "npz"];
@@ -25,6 +28,10 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
         BTreeMap::from([(listing::stem(source), source.to_owned())])
     };
     let alone = files.len() == 1;
+    let mut classes = BTreeMap::new();
+    for path in files.values() {
+        add_classes(path, &mut classes)?;
+    }
     let (mut pictures, mut values) = (Vec::new(), 0);
     for (name, path) in files {
         let found = read(&path, name, alone)?;
@@ -46,8 +53,9 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
     }
     for id in 1..=u16::MAX {
         if table[usize::from(id)].is_some() {
+            let class = classes.get(&id).map(String::as_str);
             let object =
-                result.objects.enter_id(id, None).map_err(|problem| Error::invalid(source, problem))?;
+                result.objects.enter_id(id, class).map_err(|problem| Error::invalid(source, problem))?;
             table[usize::from(id)] = Some(object);
         }
     }
@@ -61,6 +69,33 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
         })
         .collect();
     Ok(result)
+}
+
+/// What Grounded SAM 2 says of the ids of an array.
+#[derive(Deserialize)]
+struct Described {
+    #[serde(default)]
+    labels: BTreeMap<String, Class>,
+}
+
+#[derive(Deserialize)]
+struct Class {
+    instance_id: u16,
+    class_name: String,
+}
+
+/// Adds the classes that are told of the ids of an array, where they are; the first of an id counts.
+fn add_classes(array: &Path, classes: &mut BTreeMap<u16, String>) -> Result<(), Error> {
+    let Some(folder) = array.parent().filter(|folder| folder.ends_with("mask_data")) else { return Ok(()) };
+    let path = folder.with_file_name("json_data").join(format!("{}.json", listing::stem(array)));
+    if listing::is_there(&path) {
+        for Class { instance_id, class_name } in json::read::<Described>(&path)?.labels.into_values() {
+            if !class_name.trim().is_empty() {
+                classes.entry(instance_id).or_insert(class_name);
+            }
+        }
+    }
+    Ok(())
 }
 
 /// Pictures of a file.
