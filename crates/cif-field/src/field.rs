@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::parameters::{LOG_CALIBRATIONS, MLP, PLANES, Tensor, TensorMut};
 use crate::{Deformation, Gaussians, Identities, Instance, Record, RecordedCamera, Timeline, Tracks};
 
 /// Order in which a view sorts its Gaussians.
@@ -69,6 +70,29 @@ impl Field {
             tracks.at(time).apply(&self.gaussians, posed.rows_mut());
         }
         posed
+    }
+
+    /// Every learnable tensor, in the order of the table; those that the field has not are empty.
+    #[must_use]
+    pub fn tensors(&self) -> Vec<Tensor<'_>> {
+        let mut tensors = self.gaussians.tensors().to_vec();
+        let (planes, mlp) = self.deformation.as_ref().map_or((&[][..], &[][..]), |d| (&d.planes, &d.mlp));
+        let calibrations = self.identities.as_ref().map_or(&[][..], |rows| &rows.log_calibrations);
+        tensors.extend([(PLANES, planes), (MLP, mlp), (LOG_CALIBRATIONS, calibrations)]);
+        tensors
+    }
+
+    /// As [`Self::tensors`], to be changed.
+    pub fn tensors_mut(&mut self) -> Vec<TensorMut<'_>> {
+        let mut tensors = Vec::from(self.gaussians.tensors_mut());
+        let (planes, mlp) = match &mut self.deformation {
+            Some(deformation) => (&mut deformation.planes[..], &mut deformation.mlp[..]),
+            None => (&mut [][..], &mut [][..]),
+        };
+        let calibrations =
+            self.identities.as_mut().map_or(&mut [][..], |rows| &mut rows.log_calibrations[..]);
+        tensors.extend([(PLANES, planes), (MLP, mlp), (LOG_CALIBRATIONS, calibrations)]);
+        tensors
     }
 
     /// Gaussians that the deformation network leaves alone, `[N]`: those that stand still, and those of groups that are

@@ -5,7 +5,7 @@ use cif_geometry::scalar::{logit, sigmoid};
 use cif_geometry::spherical_harmonics::{BAND_0, COEFFICIENTS};
 use rayon::prelude::*;
 
-use crate::FieldError;
+use crate::error::{FieldError, finite};
 use crate::neighbours::NearestNeighbours;
 use crate::parameters::{self, Parameter, Tensor, TensorMut};
 
@@ -278,8 +278,8 @@ impl Gaussians {
         if colors.len() != n {
             return Err(FieldError::Length { array: "colors", found: colors.len(), expected: n });
         }
-        crate::validate::finite("positions", positions.as_flattened(), 3)?;
-        crate::validate::finite("colors", colors.as_flattened(), 3)?;
+        finite("positions", positions.as_flattened(), 3)?;
+        finite("colors", colors.as_flattened(), 3)?;
         let neighbours = NearestNeighbours::new(positions);
         let log_scales = (0..n)
             .into_par_iter()

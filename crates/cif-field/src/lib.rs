@@ -15,7 +15,7 @@
 //! | [`exposure`] | what cameras make of colours |
 //! | [`field`] | all of it together |
 //! | [`fingerprint`] | whether two fields are the same |
-//! | [`validate`] | which rules every field keeps |
+//! | [`error`] | which rules every field keeps ([`Field::validate`]) |
 //! | [`health`] | what is numerically broken or odd, and how broken parts are repaired |
 //! | [`query`] | what exists at a place and time, and whose it is |
 //! | [`checkpoint`] | how `.cif` files are laid out, read and written |
@@ -59,6 +59,7 @@
 pub mod checkpoint;
 pub mod deformation;
 pub mod embedding;
+pub mod error;
 pub mod exposure;
 pub mod field;
 pub mod fingerprint;
@@ -74,11 +75,12 @@ pub mod record;
 mod testing;
 pub mod timeline;
 pub mod tracks;
-pub mod validate;
+mod validate;
 
 pub use checkpoint::{Checkpoint, CheckpointError, StateTensor, TrainingState};
 pub use deformation::{Deformation, DeformationConfig, Heads, TimeEncoding};
 pub use embedding::{Embedding, Embeddings};
+pub use error::FieldError;
 pub use exposure::Exposure;
 pub use field::{Field, SortMetric};
 pub use gaussians::{Gaussians, GaussiansMut};
@@ -89,4 +91,3 @@ pub use query::{FieldAtTime, QueryResult};
 pub use record::{Declared, Drawing, FrameCodes, Record, RecordError, Run};
 pub use timeline::{RecordedCamera, Timeline};
 pub use tracks::{Joint, JointKind, RotationEvidence, TrackGroup, Tracks};
-pub use validate::FieldError;

@@ -1,8 +1,6 @@
 //! The table of learnable tensors. Everything that only carries parameters (gradients, optimiser state, checks,
 //! files, changes of the set of Gaussians, buffers on a GPU) loops over it.
 
-use crate::Field;
-
 /// Owner of the rows of a parameter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rows {
@@ -130,7 +128,7 @@ pub const LOG_CALIBRATIONS: Parameter = Parameter {
     ..Parameter::gaussians("log_calibrations", "calibration", &[])
 };
 
-/// Every learnable tensor, in the order of [`Field::tensors`].
+/// Every learnable tensor, in the order of [`crate::Field::tensors`].
 pub const TABLE: [Parameter; 9] = [
     MEANS,
     LOG_SCALES,
@@ -148,31 +146,6 @@ pub type Tensor<'a> = (Parameter, &'a [f32]);
 
 /// A parameter with its values, to be changed.
 pub type TensorMut<'a> = (Parameter, &'a mut [f32]);
-
-impl Field {
-    /// Every learnable tensor, in the order of the table; those that the field has not are empty.
-    #[must_use]
-    pub fn tensors(&self) -> Vec<Tensor<'_>> {
-        let mut tensors = self.gaussians.tensors().to_vec();
-        let (planes, mlp) = self.deformation.as_ref().map_or((&[][..], &[][..]), |d| (&d.planes, &d.mlp));
-        let calibrations = self.identities.as_ref().map_or(&[][..], |rows| &rows.log_calibrations);
-        tensors.extend([(PLANES, planes), (MLP, mlp), (LOG_CALIBRATIONS, calibrations)]);
-        tensors
-    }
-
-    /// As [`Self::tensors`], to be changed.
-    pub fn tensors_mut(&mut self) -> Vec<TensorMut<'_>> {
-        let mut tensors = Vec::from(self.gaussians.tensors_mut());
-        let (planes, mlp) = match &mut self.deformation {
-            Some(deformation) => (&mut deformation.planes[..], &mut deformation.mlp[..]),
-            None => (&mut [][..], &mut [][..]),
-        };
-        let calibrations =
-            self.identities.as_mut().map_or(&mut [][..], |rows| &mut rows.log_calibrations[..]);
-        tensors.extend([(PLANES, planes), (MLP, mlp), (LOG_CALIBRATIONS, calibrations)]);
-        tensors
-    }
-}
 
 #[cfg(test)]
 mod tests {

@@ -16,7 +16,7 @@ const MOST: [(&str, usize); 19] = [
     ("cif-input", 0),
     ("cif-system", 0),
     ("cif-dataset", 0),
-    ("cif-field", 12),
+    ("cif-field", 0),
     ("cif-vision", 2),
     ("cif-render", 5),
     ("cif-masks", 0),

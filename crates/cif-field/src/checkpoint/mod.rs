@@ -36,60 +36,21 @@
 //! its destination and renamed, so a failed save leaves what was there. A reader trusts nothing: it allocates
 //! no more than a small multiple of the file's length, and checks everything that later code relies on.
 
+mod contents;
 mod error;
 mod format;
 mod read;
 mod write;
 
-use std::collections::BTreeMap;
 use std::io::{Read, Seek, Write};
 use std::path::Path;
 
+pub use contents::{Checkpoint, StateTensor, TrainingState};
 pub use error::CheckpointError;
 pub use format::FORMAT;
 
+use self::contents::States;
 use crate::Field;
-
-/// A scene and, when its training may go on, where the training stood.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Checkpoint {
-    /// The scene.
-    pub field: Field,
-    /// State of the run; `None` in a finished scene.
-    pub training: Option<TrainingState>,
-    /// Tensors by which a finished scene tells labels of pixels other than by its identity rows: the head that
-    /// it was trained with, by name, and what that learnt. `None` where its rows tell them.
-    pub head: Option<TrainingState>,
-}
-
-/// State beside the field: that from which a run goes on exactly as if it had not been interrupted, or that of a head.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct TrainingState {
-    /// Counters, settings, random generators.
-    pub json: serde_json::Value,
-    /// Moments and other per-parameter state, by name.
-    pub tensors: BTreeMap<String, StateTensor>,
-}
-
-/// A flat tensor of a [`TrainingState`].
-#[derive(Clone, Debug, PartialEq)]
-pub enum StateTensor {
-    /// Single precision.
-    F32(Vec<f32>),
-    /// Double precision.
-    F64(Vec<f64>),
-    /// 32-bit counters.
-    U32(Vec<u32>),
-    /// 64-bit counters.
-    U64(Vec<u64>),
-}
-
-/// Contents that are written beside a field.
-#[derive(Clone, Copy, Default)]
-struct States<'a> {
-    training: Option<&'a TrainingState>,
-    head: Option<&'a TrainingState>,
-}
 
 impl Checkpoint {
     /// Writes the file, replacing an older one only once the new one is complete on disk.

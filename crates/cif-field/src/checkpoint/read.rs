@@ -8,13 +8,14 @@ use std::path::Path;
 use safetensors::Dtype;
 use safetensors::tensor::{Metadata, TensorInfo};
 
+use super::contents::{Checkpoint, StateTensor, TrainingState};
+use super::error::CheckpointError;
 use super::format::{
     FIELD_KEY, FORMAT, FORMAT_KEY, FieldJson, HEAD_KEY, HEAD_PREFIX, LABELS, LOG_ESTIMATES, MAX_HEADER,
     OWNERS, POSE_FLOATS, ROW_OFFSETS, STILL, SamplesJson, TRACK_COLORS, TRACK_GROUPS, TRACK_LOG_SCALES,
     TRACK_MEANS, TRACK_OPACITIES, TRACK_POSES, TRACK_QUATERNIONS, TRAINING_KEY, TRAINING_PREFIX, TrackArrays,
     TrackGroupJson, VERSION_KEY,
 };
-use super::{Checkpoint, CheckpointError, StateTensor, TrainingState};
 use crate::gaussians::RowSource;
 use crate::gaussians::SH_FLOATS;
 use crate::parameters::{LOG_CALIBRATIONS, MEANS, MLP, PLANES};

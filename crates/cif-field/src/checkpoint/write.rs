@@ -9,13 +9,14 @@ use safetensors::Dtype;
 use safetensors::tensor::TensorInfo;
 use serde::Serialize;
 
+use super::contents::{StateTensor, States};
+use super::error::CheckpointError;
 use super::format::{
     FIELD_KEY, FORMAT_KEY, FieldJson, HEAD_KEY, HEAD_PREFIX, LABELS, LOG_ESTIMATES, MAX_HEADER, OWNERS,
     POSE_FLOATS, ROW_OFFSETS, STILL, TRACK_COLORS, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS,
     TRACK_OPACITIES, TRACK_POSES, TRACK_QUATERNIONS, TRAINING_KEY, TRAINING_PREFIX, TrackArrays, VERSION_KEY,
     format_of, owner_codes, still_rows,
 };
-use super::{CheckpointError, StateTensor, States};
 use crate::Field;
 use crate::gaussians::SH_FLOATS;
 

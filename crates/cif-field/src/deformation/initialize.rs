@@ -5,7 +5,8 @@ use glam::DVec3;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 
-use super::{ConfigError, Deformation, DeformationConfig, LinearLayout, is_time_plane};
+use super::{Deformation, DeformationConfig, LinearLayout, is_time_plane};
+use crate::error::ConfigError;
 
 /// Range of fresh spatial planes.
 const SPATIAL_RANGE: std::ops::Range<f32> = 0.1..0.5;

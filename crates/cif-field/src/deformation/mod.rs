@@ -8,9 +8,10 @@ pub mod evaluate;
 pub mod initialize;
 mod validate;
 
+pub use crate::error::ConfigError;
 pub use validate::{
-    ConfigError, MAX_CHANNELS, MAX_LEVELS, MAX_MULTIPLIER, MAX_PLANE_FLOATS, MAX_SPATIAL_RESOLUTION,
-    MAX_TIME_RESOLUTION, MAX_WIDTH,
+    MAX_CHANNELS, MAX_LEVELS, MAX_MULTIPLIER, MAX_PLANE_FLOATS, MAX_SPATIAL_RESOLUTION, MAX_TIME_RESOLUTION,
+    MAX_WIDTH,
 };
 
 use std::ops::Range;

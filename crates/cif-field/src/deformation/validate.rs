@@ -1,6 +1,7 @@
 //! Limits of a deformation's shape, within which layout arithmetic cannot overflow.
 
 use super::DeformationConfig;
+use crate::error::ConfigError;
 
 /// Most nodes along a spatial axis at multiplier 1.
 pub const MAX_SPATIAL_RESOLUTION: u32 = 4096;
@@ -16,18 +17,6 @@ pub const MAX_CHANNELS: u32 = 256;
 pub const MAX_WIDTH: u32 = 1024;
 /// Most floats in all planes: 8 GiB.
 pub const MAX_PLANE_FLOATS: u64 = 1 << 31;
-
-/// A shape that no deformation can have.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("the deformation's `{name}` is {value}, expected {expected}")]
-pub struct ConfigError {
-    /// Setting.
-    pub name: &'static str,
-    /// Its value.
-    pub value: String,
-    /// The range.
-    pub expected: String,
-}
 
 impl DeformationConfig {
     /// Checks that every setting is in range; the layouts may be asked for only then.

@@ -149,8 +149,16 @@ pub struct TracksAtTime<'a> {
     members: Vec<u32>,
 }
 
+impl Tracks {
+    /// The groups at a normalised time.
+    #[must_use]
+    pub fn at(&self, time: f64) -> TracksAtTime<'_> {
+        TracksAtTime::new(self, time)
+    }
+}
+
 impl<'a> TracksAtTime<'a> {
-    pub(super) fn new(tracks: &'a Tracks, time: f64) -> Self {
+    fn new(tracks: &'a Tracks, time: f64) -> Self {
         let groups: Vec<GroupAtTime<'a>> = tracks
             .groups
             .iter()

@@ -16,6 +16,7 @@
 
 mod apply;
 mod joint;
+mod jointed;
 
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
@@ -277,12 +278,6 @@ impl TrackGroup {
 }
 
 impl Tracks {
-    /// The groups at a normalised time.
-    #[must_use]
-    pub fn at(&self, time: f64) -> TracksAtTime<'_> {
-        TracksAtTime::new(self, time)
-    }
-
     /// True when anything moves, apart from visibility.
     #[must_use]
     pub fn moves(&self) -> bool {

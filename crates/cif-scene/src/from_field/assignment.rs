@@ -135,14 +135,16 @@ pub fn assign(
     let groups = group_instances::of_groups(field, visible, &owners);
     let is_estimated = |position: &usize| owner_of(*position) == Owner::Estimated;
     let Some(tracks) = &field.tracks else { return Assignment { owners, groups } };
+    let group_of = |position: &usize| tracks.group(visible[*position] as usize);
     let mut is_posed = vec![false; field.instances.len()];
-    for (_, instance) in tracks.groups.iter().zip(&groups).filter(|(group, _)| !group.deformed) {
-        instance.iter().for_each(|instance| is_posed[*instance] = true);
+    for group in (0..visible.len()).filter_map(|position| group_of(&position)) {
+        if let (Some(instance), false) = (groups[group], tracks.groups[group].deformed) {
+            is_posed[instance] = true;
+        }
     }
     for position in (0..visible.len()).filter(is_estimated) {
-        let of_group = tracks.group(visible[position] as usize).and_then(|group| groups[group]);
         let stays = owners[position].filter(|owner| !is_posed[*owner]);
-        owners[position] = of_group.or(stays);
+        owners[position] = group_of(&position).and_then(|group| groups[group]).or(stays);
     }
     Assignment { owners, groups }
 }
@@ -285,6 +287,12 @@ mod tests {
         let expected: Vec<_> =
             (0..field.len()).map(|row| if row == told { Some(0) } else { owner(row) }).collect();
         assert_eq!(owners(&field), expected);
+        // A group without Gaussians is nothing of its instance.
+        let tracks = field.tracks.as_mut().unwrap();
+        tracks.group_of[..MEMBERS].fill(cif_field::tracks::NO_GROUP);
+        let found = owners(&field);
+        assert_eq!((found[shadow], found[0], found[stray]), (Some(0), Some(0), None));
+        field.tracks.as_mut().unwrap().group_of[..MEMBERS].fill(0);
         // Where the network moves the object too, its shadow may be what it left out.
         field.tracks.as_mut().unwrap().groups[0].deformed = true;
         let found = owners(&field);

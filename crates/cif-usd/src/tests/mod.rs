@@ -7,6 +7,7 @@ mod edited;
 mod foreign;
 mod fuzz;
 mod outputs;
+mod recorded;
 mod round_trip;
 mod scenes;
 mod schema;
