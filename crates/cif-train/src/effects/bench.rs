@@ -5,7 +5,6 @@ use cif_render::cpu::SimdLevel;
 use cif_render::{Channels, RenderSettings};
 
 use super::changes::Changes;
-use super::motions::moved_as_at;
 use crate::config::TrainConfig;
 use crate::engine::failure::draw;
 use crate::engine::{Changed, Engine, Views};
@@ -98,45 +97,16 @@ impl Bench<'_> {
         trial: Option<&Field>,
         settings: &RenderSettings,
     ) -> Result<JudgedErrors, TrainError> {
-        let mut errors = JudgedErrors::none(self.state.field.instances.len());
-        let views: Vec<usize> = judged_views(self.state.frames.len()).collect();
-        self.add_errors(&mut errors, &views, trial, settings)?;
-        Ok(errors)
-    }
-
-    /// The same for judging whether something moves. Where each time has one image, the network can move anything to
-    /// suit that image, to make up for its pose or its exposure, and pixels of the image that train nothing gain by it
-    /// too. There each view is drawn with what the network does at the training times around it: motion goes on between
-    /// these, and what suits one image alone does not.
-    pub(crate) fn errors_of_motion(&mut self, trial: Option<&Field>) -> Result<JudgedErrors, TrainError> {
-        let settings = self.state.color_settings();
-        if self.state.dataset.images_at_once() > 1 {
-            return self.errors(trial, &settings);
-        }
-        let mut errors = JudgedErrors::none(self.state.field.instances.len());
-        let times = training_times(self.state);
-        for view in judged_views(self.state.frames.len()) {
-            let time = self.state.dataset.frames[self.state.frames.index(view)].time;
-            let shown = moved_as_at(trial.unwrap_or(&self.state.field), &times_around(&times, time));
-            self.add_errors(&mut errors, &[view], Some(&shown), &settings)?;
-        }
-        Ok(errors)
-    }
-
-    /// Adds the errors on the held-out pixels of some views.
-    fn add_errors(
-        &mut self,
-        errors: &mut JudgedErrors,
-        views: &[usize],
-        trial: Option<&Field>,
-        settings: &RenderSettings,
-    ) -> Result<(), TrainError> {
         let state = &mut *self.state;
+        let views: Vec<usize> = judged_views(state.frames.len()).collect();
         let frames: Vec<usize> = views.iter().map(|view| state.frames.index(*view)).collect();
         let mut truth = Vec::with_capacity(views.len());
         for view in views {
-            truth.push(state.frames.get(&state.dataset, *view)?);
+            truth.push(state.frames.get(&state.dataset, view)?);
         }
+        let labels = state.field.instances.len() + 1;
+        let mut errors =
+            JudgedErrors { all: SquaredError::default(), of_labels: vec![SquaredError::default(); labels] };
         let channels = Channels { depth: false, instances: false };
         let mut truth = truth.iter();
         let views = Views { frames: &frames, settings, channels };
@@ -151,7 +121,8 @@ impl Bench<'_> {
                     errors.of_labels[usize::from(label)].add(difference);
                 }
             }
-        })
+        })?;
+        Ok(errors)
     }
 
     /// Reports a judgement: `what` was judged, in words, its gain on held-out pixels, dB, and whether it stays.
@@ -204,30 +175,6 @@ pub(crate) struct JudgedErrors {
     pub(crate) of_labels: Vec<SquaredError>,
 }
 
-impl JudgedErrors {
-    fn none(instances: usize) -> Self {
-        Self { all: SquaredError::default(), of_labels: vec![SquaredError::default(); instances + 1] }
-    }
-}
-
-/// Times of the training frames, ascending.
-fn training_times(state: &State) -> Vec<f64> {
-    let time = |view| state.dataset.frames[state.frames.index(view)].time;
-    let mut times: Vec<f64> = (0..state.frames.len()).map(time).collect();
-    times.sort_unstable_by(f64::total_cmp);
-    times.dedup();
-    times
-}
-
-/// The last of some ascending times before a time and the first after it; one of them at the ends, and the time itself
-/// where there is no other.
-fn times_around(times: &[f64], time: f64) -> Vec<f64> {
-    let before = times.iter().rev().find(|other| **other < time);
-    let after = times.iter().find(|other| **other > time);
-    let around: Vec<f64> = before.into_iter().chain(after).copied().collect();
-    if around.is_empty() { vec![time] } else { around }
-}
-
 /// Gain of a smaller error, dB.
 pub(crate) fn gain(without: f64, with: f64) -> f64 {
     10.0 * (without.max(1e-12) / with.max(1e-12)).log10()
@@ -250,15 +197,6 @@ mod tests {
         assert_eq!(judged_views(3).collect::<Vec<_>>(), [0, 1, 2]);
         assert_eq!(judged_views(80).collect::<Vec<_>>(), [0, 10, 20, 30, 40, 50, 60, 70]);
         assert_eq!(judged_views(0).count(), 0);
-    }
-
-    #[test]
-    fn times_around_a_time_leave_it_out() {
-        let times = [0.0, 0.25, 0.5, 1.0];
-        assert_eq!(times_around(&times, 0.5), [0.25, 1.0]);
-        assert_eq!(times_around(&times, 0.0), [0.25]);
-        assert_eq!(times_around(&times, 1.0), [0.5]);
-        assert_eq!(times_around(&[0.5], 0.5), [0.5]);
     }
 
     #[test]

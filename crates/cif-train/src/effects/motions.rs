@@ -159,26 +159,6 @@ fn set_still(field: &mut Field, motions: &[Motion], to: bool, wanted: impl Fn(us
     changed
 }
 
-/// The field with what the network does at some times, in the mean, for what it does at every time. Gaussians of objects
-/// with poses of their own stay as they are.
-pub(super) fn moved_as_at(field: &Field, times: &[f64]) -> Field {
-    let mut moved = field.clone();
-    let (Some(deformation), Some(of_moved)) = (&field.deformation, &mut moved.deformation) else {
-        return moved;
-    };
-    let is_grouped = |row: usize| field.tracks.as_ref().is_some_and(|tracks| tracks.group(row).is_some());
-    let rows: Vec<u32> = (0..field.len())
-        .filter(|row| !deformation.is_still(*row) && !is_grouped(*row))
-        .map(|row| row as u32)
-        .collect();
-    of_moved.still.resize(field.len(), false);
-    for (row, motion) in rows.iter().zip(probe(deformation, &field.gaussians, &rows, times)) {
-        motion.mean.add_to(&mut moved.gaussians, *row as usize, 1.0);
-        of_moved.still[*row as usize] = true;
-    }
-    moved
-}
-
 /// Motions that the network gives rows over some times, also rows that are marked as still.
 pub(crate) fn probe(
     deformation: &Deformation,
@@ -289,23 +269,6 @@ mod tests {
                 assert!(moved <= if is_still { limit * 1.001 } else { 0.0 }, "{row}: {moved}");
             }
         }
-    }
-
-    #[test]
-    fn a_field_moved_as_at_other_times_is_there_what_it_is_between_them() {
-        let mut field = field();
-        field.deformation.as_mut().unwrap().still = (0..60).map(|row| row < 20).collect();
-        let (first, last) = (field.deformed(0.2), field.deformed(0.3));
-        let moved = moved_as_at(&field, &[0.2, 0.3]);
-        for time in [0.0, 0.25, 0.9] {
-            let now = moved.deformed(time);
-            for row in 0..60 {
-                let between: [f32; 3] =
-                    std::array::from_fn(|axis| 0.5 * (first.means[row][axis] + last.means[row][axis]));
-                assert!(distance(&now.means[row], &between) < 1e-5, "{row} at {time}");
-            }
-        }
-        assert_eq!(moved_as_at(&field, &[0.2]).deformed(0.7).means, first.means);
     }
 
     #[test]

@@ -34,14 +34,15 @@ pub(crate) fn rest_instances(bench: &mut Bench<'_>, motions: &[Motion]) -> Resul
         return Ok(0);
     }
     let trembling = trembling(bench.state, motions, &instance_of);
-    let before = bench.errors_of_motion(None)?;
+    let settings = bench.state.color_settings();
+    let before = bench.errors(None, &settings)?;
     while resting.contains(&true) {
         let mut trial = bench.state.field.clone();
         let rests = |row: usize| {
             instance_of[row].is_some_and(|instance| resting[instance]) && !is_mover(bench.state, row)
         };
         let count = put_to_rest(&mut trial, motions, rests);
-        let after = bench.errors_of_motion(Some(&trial))?;
+        let after = bench.errors(Some(&trial), &settings)?;
         let missed = missed(&before, &after, &resting, &trembling);
         if missed.is_empty() {
             bench.state.field = trial;

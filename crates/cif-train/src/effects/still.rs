@@ -7,8 +7,7 @@
 //! still go through the network all the same. Where these learn to move, their neighbours are handed back. Where all
 //! cameras stay in place, their images tell from the start: what they see change stays in the network for half of the
 //! fine stage, and the rest leaves it at once. Where masks tell which objects travel, the same holds for these from
-//! an early step of a long stage on, provided that it hardly shows; what else moves is then handed back. What shows is
-//! judged by motion that goes on between images, see [`Bench::errors_of_motion`].
+//! an early step of a long stage on, provided that it hardly shows; what else moves is then handed back.
 
 use cif_field::Field;
 use rand::RngExt;
@@ -30,10 +29,6 @@ use crate::stage::Stage;
 /// and forth.
 const RELEASE: f32 = 2.0;
 
-/// Where masks tell the travelling objects: loss, dB on held-out pixels, up to which everything else is taken to
-/// stand still on the first test.
-const TOLD_LOSS: f64 = 0.1;
-
 /// Rungs of the ladder of limits, each half of the one above.
 const RUNGS: u32 = 3;
 
@@ -54,11 +49,11 @@ impl Effect for Still {
     /// move.
     fn judge(&self, bench: &mut Bench<'_>) -> Result<(), TrainError> {
         let Some(evidence) = Evidence::of(bench)? else { return Ok(()) };
-        let mut error = bench.errors_of_motion(None)?.all.mean();
+        let mut error = bench.error(None)?;
         let mut settled = None;
         if bench.moment().has(Due::StillByMasks) {
             let stands = |row: usize| !evidence.watched[row] && !evidence.travels[row];
-            settled = try_to_settle(bench, &evidence.motions, stands, &mut error, TOLD_LOSS)?;
+            settled = try_to_settle(bench, &evidence.motions, stands, &mut error)?;
         }
         let mut released = 0;
         if settled.is_none() {
@@ -134,14 +129,13 @@ fn climb_down(
     evidence: &Evidence,
     error: &mut f64,
 ) -> Result<Option<usize>, TrainError> {
-    let allowed = f64::from(bench.config().effects.still_loss);
     // Not far above the rung that held last time, so that few are tried in vain.
     let mut rung = bench.state.progress.still_rung.saturating_sub(1);
     let mut settled = None;
     while settled.is_none() && rung < RUNGS {
         let limits = evidence.highest.scaled(0.5_f32.powi(rung as i32));
         let rests = |row: usize| !evidence.awake[row] && limits.hold(&evidence.motions[row]);
-        settled = try_to_settle(bench, &evidence.motions, rests, error, allowed)?;
+        settled = try_to_settle(bench, &evidence.motions, rests, error)?;
         rung += u32::from(settled.is_none());
     }
     bench.state.progress.still_rung = rung.min(RUNGS - 1);
@@ -156,7 +150,7 @@ fn hand_back(bench: &mut Bench<'_>, evidence: &Evidence, error: f64) -> Result<u
     let mut released = wake(&mut trial, motions, |row| !highest.scaled(RELEASE).hold(&motions[row]));
     let woken = released + wake(&mut trial, motions, |row| awake[row]);
     // Where nothing is trained, the network may do anything: what it says must fit the pictures.
-    if woken > 0 && gain(bench.errors_of_motion(Some(&trial))?.all.mean(), error) > allowed {
+    if woken > 0 && gain(bench.error(Some(&trial))?, error) > allowed {
         trial = bench.state.field.clone();
         released = 0;
         wake(&mut trial, motions, |row| watched[row] && highest.hold(&motions[row]));
@@ -165,20 +159,19 @@ fn hand_back(bench: &mut Bench<'_>, evidence: &Evidence, error: f64) -> Result<u
     Ok(released)
 }
 
-/// Puts rows to rest where the `error` in the held-out pixels grows by no more dB than allowed; returns how many and
+/// Puts rows to rest where the `error` in the held-out pixels grows by no more than `effects.still_loss`; returns how many and
 /// leaves the new error, or `None`.
 fn try_to_settle(
     bench: &mut Bench<'_>,
     motions: &[Motion],
     wanted: impl Fn(usize) -> bool,
     error: &mut f64,
-    allowed: f64,
 ) -> Result<Option<usize>, TrainError> {
     let mut trial = bench.state.field.clone();
     let found = put_to_rest(&mut trial, motions, wanted);
     if found > 0 {
-        let after = bench.errors_of_motion(Some(&trial))?.all.mean();
-        if gain(after, *error) > allowed {
+        let after = bench.error(Some(&trial))?;
+        if gain(after, *error) > f64::from(bench.config().effects.still_loss) {
             return Ok(None);
         }
         (bench.state.field, *error) = (trial, after);
