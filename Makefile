@@ -27,13 +27,14 @@ ONNXRUNTIME := onnxruntime==1.23.2
 MUJOCO := mujoco[usd]==4.0.0
 NEWTON := newton==1.8.0 newton-usd-schemas==0.6.0 warp-lang==1.19.0 usd-core==26.8 scipy numpy
 VALIDATOR := omniverse-asset-validator==1.18.0 usd-core==26.8
+SIMREADY := simready-foundation-tier-core==2026.8.0 usd-core==26.8
 PYCOLMAP := pycolmap==4.2.1
 BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13 bpy==5.3.0/python3.13
 
 # One interpreter for every build, or PyO3 is built again.
 export PYO3_PYTHON := $(abspath $(BIN)/python)
 
-.PHONY: help build wheel demo plugin stubs docs test test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-blender test-capture fuzz lint format clean
+.PHONY: help build wheel demo plugin stubs docs test test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-simready test-blender test-capture fuzz lint format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
@@ -45,6 +46,7 @@ help:
 	@echo "make fuzz    damaged files for every reader, MINUTES=60 long; READER= picks one"
 	@echo "make test-mujoco, test-newton, test-blender   tests with these tools, which are downloaded (75 MB, 300 MB, 1.5 GB)"
 	@echo "make test-validator   NVIDIA's validator on our stages, which is downloaded (50 MB)"
+	@echo "make test-simready   NVIDIA's SimReady features of our stages, which are downloaded (100 MB)"
 	@echo "make test-capture   tests of cif capture with pycolmap, which is downloaded (50 MB), and ffmpeg where it is there"
 	@echo "make stubs   docstrings of the Python module into its stub"
 	@echo "make docs    the pages of docs/reference, generated from the code"
@@ -153,6 +155,11 @@ test-validator: test-wheel
 	test -x $(VENV)/validator/bin/python || $(PYTHON) -m venv $(VENV)/validator
 	$(VENV)/validator/bin/python -m pip install --quiet --disable-pip-version-check $(VALIDATOR)
 	CIF_TEST_VALIDATOR=$(VENV)/validator/bin/python $(TEST_BIN)/python -m pytest tests/python/test_validator.py
+
+test-simready: test-wheel
+	test -x $(VENV)/simready/bin/python || $(PYTHON) -m venv $(VENV)/simready
+	$(VENV)/simready/bin/python -m pip install --quiet --disable-pip-version-check $(SIMREADY)
+	CIF_TEST_SIMREADY=$(VENV)/simready/bin/python $(TEST_BIN)/python -m pytest tests/python/test_simready.py
 
 test-capture:
 	test -x $(VENV)/capture/bin/python || $(PYTHON) -m venv $(VENV)/capture

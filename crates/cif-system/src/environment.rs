@@ -75,6 +75,8 @@ variables! {
     TEST_NEWTON = "CIF_TEST_NEWTON", Tests, "a program or its path", default "the tests are skipped";
     /// Python with NVIDIA's asset validator, for `tests/python/test_validator.py`.
     TEST_VALIDATOR = "CIF_TEST_VALIDATOR", Tests, "a program or its path", default "the tests are skipped";
+    /// Python with NVIDIA's SimReady features, for `tests/python/test_simready.py`.
+    TEST_SIMREADY = "CIF_TEST_SIMREADY", Tests, "a program or its path", default "the tests are skipped";
     /// Time for which `make fuzz` damages files, with random seeds.
     FUZZ_MINUTES = "CIF_FUZZ_MINUTES", Tests, "minutes", default "a fixed number of files with fixed seeds";
     /// Readers that are given damaged files: those whose name contains the text.

@@ -38,7 +38,7 @@ fn bytes(trainer: &Trainer) -> Vec<u8> {
     let mut checkpoint = trainer.checkpoint(true);
     checkpoint.field.record = Default::default();
     let state = checkpoint.training.as_mut().unwrap();
-    for key in ["wall_s", "cpu_s", "curve"] {
+    for key in ["wall_s", "cpu_s", "stages_s", "effects_s", "curve"] {
         state.json["progress"][key] = serde_json::Value::Null;
     }
     let mut bytes = Vec::new();

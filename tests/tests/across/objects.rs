@@ -118,7 +118,7 @@ fn a_scene_shows_and_tells_its_objects() {
     assert!(hit("--box 5,5,5,6,6,6").is_empty());
     assert_eq!(hit("--interval 0%:100%").len(), 2);
     let elsewhere = cif(path, "query scene.cif --box 5,5,5,6,6,6").succeeds().stdout;
-    assert!(elsewhere.contains("nothing is there"), "{elsewhere}");
+    assert!(elsewhere.contains("scene.cif has no such object"), "{elsewhere}");
     cif(path, "query scene.cif --label ball --taxonomy instance").fails(1, &["ball", "red_ball_003"]);
 
     // By a name in the vocabulary of others, also in an exported file and in what comes back of it.
