@@ -35,8 +35,8 @@ impl Trainer {
     /// # Errors
     /// When a setting cannot work; when the scene is of other times, frames or cameras than the capture, does
     /// not move, or is not reconstructed yet; when images that it was trained on have changed since, unless
-    /// [`accept_changes`](crate::accept_changes) was asked; when no training mask has a labelled pixel; when a frame cannot be
-    /// read; [`TrainError::Stopped`] when the stop of `start` was requested meanwhile.
+    /// [`accept_changes`](crate::accept_changes) was asked; when no training mask has a labelled pixel; when a frame
+    /// cannot be read; [`TrainError::Stopped`] when the stop of `start` was requested meanwhile.
     pub fn from_scene(
         start: impl Into<Start>,
         mut config: TrainConfig,
@@ -53,6 +53,7 @@ impl Trainer {
         check_capture(&field, &dataset)?;
         let mut progress = Progress::at(Stage::Identity);
         let mut state = None;
+        let mut has_same_masks = false;
         if let Some(training) = training {
             let parsed = SavedState::parse(training.json)?;
             match parsed.progress.stage {
@@ -60,6 +61,7 @@ impl Trainer {
                     return Err(TrainError::Unfinished { scene: name.to_owned(), stage });
                 }
                 Stage::Identity => {
+                    has_same_masks = parsed.is_known_of(&dataset);
                     progress = parsed.progress;
                     state = Some((training.tensors, parsed.adam_steps));
                 }
@@ -78,7 +80,10 @@ impl Trainer {
             gaussians: field.gaussians.len(),
             train: serde_json::to_value(&field.record.run).unwrap_or_default(),
         });
-        field.replace_instances(initialize::instances(&dataset));
+        if !has_same_masks {
+            // Groups may be of other objects by these masks.
+            field.replace_instances(initialize::instances(&dataset));
+        }
         field.gaussians.occupancy_logits.fill(logit(config.instance.occupancy));
         (field.background, field.sort_metric) = (config.background, config.sort_metric);
         let mut trainer = Self::assemble(

@@ -77,6 +77,12 @@ impl SavedState {
         let state: Self = serde_json::from_value(json).map_err(|error| unusable(error.to_string()))?;
         state.progress.problem().map_or(Ok(state), |problem| Err(unusable(problem)))
     }
+
+    /// True where it is known that the run was of the same capture, masks included.
+    pub(super) fn is_known_of(&self, dataset: &Dataset) -> bool {
+        self.capture.inputs.is_some()
+            && self.capture.check(&Capture::of(dataset, &inputs_of(dataset)), dataset).is_ok()
+    }
 }
 
 impl Capture {
