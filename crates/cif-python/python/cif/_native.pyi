@@ -353,12 +353,13 @@ def train(
     or "auto".
 
     callback is called in this thread with a dictionary for each event of the run; its "event" is "stage_started",
-    "step" (every report.step_every steps: stage, iteration, iterations, loss, psnr, gaussians, eta_s), "evaluated",
-    "note", "warning", "finished" and more. Work without steps is reported as "phase_started", "phase_progress" (phase,
-    done, total, elapsed_s, eta_s) and "phase_ended" (phase, wall_s, cpu_s), from the opening of the capture on. When it
-    returns False the run stops and the field as it is then is returned; CifError is raised where it stops before the
-    first step. An exception in it stops the run and is raised, as is KeyboardInterrupt on Ctrl-C. In all three cases
-    the run is saved to output first, and resume=True goes on with it, with the settings of the file.
+    "stage_ended" (stage, wall_s), "step" (every report.step_every steps: stage, iteration, iterations, loss, psnr,
+    gaussians, eta_s), "evaluated", "note", "warning", "finished" and more. Work without steps is reported as
+    "phase_started", "phase_progress" (phase, done, total, elapsed_s, eta_s) and "phase_ended" (phase, wall_s, cpu_s),
+    from the opening of the capture on. When it returns False the run stops and the field as it is then is returned;
+    CifError is raised where it stops before the first step. An exception in it stops the run and is raised, as is
+    KeyboardInterrupt on Ctrl-C. In all three cases the run is saved to output first, and resume=True goes on with it,
+    with the settings of the file.
 
     An output that exists is refused without force or resume. Raises CifError when the capture, a setting or the
     output is not as it should be. Other Python threads run meanwhile.
