@@ -178,8 +178,7 @@ impl Field {
     pub fn replace_instances(&mut self, instances: Vec<Instance>) {
         self.instances = instances;
         self.identities = None;
-        let groups = self.tracks.iter_mut().flat_map(|tracks| &mut tracks.groups);
-        groups.for_each(|group| group.instance = None);
+        self.tracks.iter_mut().for_each(Tracks::forget_instances);
     }
 
     /// Position in [`Field::instances`] of the instance with a mask value.

@@ -284,6 +284,11 @@ impl Tracks {
         self.groups.iter().any(TrackGroup::moves)
     }
 
+    /// Leaves open which instances the groups are of.
+    pub fn forget_instances(&mut self) {
+        self.groups.iter_mut().for_each(|group| group.instance = None);
+    }
+
     /// Poses of all groups.
     #[must_use]
     pub fn poses(&self) -> usize {

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use cif_field::tracks::Tracks;
 use cif_render::Gradients;
 
 use super::saving::Saving;
@@ -438,6 +439,8 @@ impl Trainer {
                 Target::Features => None,
             };
             self.state.optimiser.start_identities(&self.state.field);
+            // The head says whose Gaussians are, whichever objects poses were fitted to.
+            self.state.field.tracks.iter_mut().for_each(Tracks::forget_instances);
         }
         self.engine.changed(Changed::Everything);
     }
