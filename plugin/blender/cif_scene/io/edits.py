@@ -1,8 +1,8 @@
 """A layer over a stage that says what changed: what an artist did, without touching the stage itself.
 
 The layer has the stage as its sublayer, so that opening the layer shows the edited scene, and
-`cif import LAYER --base scene.cif` brings the edits home. Values are written next to samples, because simulators
-and validators read the default time.
+`cif import LAYER --base scene.cif` brings the edits home. Values are written next to samples, because
+simulators and validators read the default time.
 """
 
 from __future__ import annotations
