@@ -379,7 +379,7 @@ pub struct EffectsConfig {
     /// next, others each time: what they learn shows where more must move. Default 0.03.
     pub still_awake: f32,
     /// Loss, dB on held-out pixels of training views, up to which a test takes Gaussians to stand still, default
-    /// 0.1: what training makes good again, since views that it never saw lose nothing.
+    /// 0.02.
     pub still_loss: f32,
     /// Gain, dB on held-out pixels of training views, that a degree of spherical harmonics must bring at half of
     /// the fine stage; else it is taken back. Until then the next degree waits while the last one brings no gain

@@ -338,7 +338,7 @@ impl Default for EffectsConfig {
             still_displacement: 0.002,
             still_shape: 0.2,
             still_awake: 0.03,
-            still_loss: 0.1,
+            still_loss: 0.02,
             sh_gain: 0.0,
             head_gain: 0.0,
             physics: true,

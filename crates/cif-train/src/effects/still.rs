@@ -29,6 +29,10 @@ use crate::stage::Stage;
 /// and forth.
 const RELEASE: f32 = 2.0;
 
+/// Where masks tell the travelling objects: loss, dB on held-out pixels, up to which everything else is taken to
+/// stand still on the first test.
+const TOLD_LOSS: f64 = 0.1;
+
 /// Rungs of the ladder of limits, each half of the one above.
 const RUNGS: u32 = 3;
 
@@ -53,7 +57,7 @@ impl Effect for Still {
         let mut settled = None;
         if bench.moment().has(Due::StillByMasks) {
             let stands = |row: usize| !evidence.watched[row] && !evidence.travels[row];
-            settled = try_to_settle(bench, &evidence.motions, stands, &mut error)?;
+            settled = try_to_settle(bench, &evidence.motions, stands, &mut error, TOLD_LOSS)?;
         }
         let mut released = 0;
         if settled.is_none() {
@@ -129,13 +133,14 @@ fn climb_down(
     evidence: &Evidence,
     error: &mut f64,
 ) -> Result<Option<usize>, TrainError> {
+    let allowed = f64::from(bench.config().effects.still_loss);
     // Not far above the rung that held last time, so that few are tried in vain.
     let mut rung = bench.state.progress.still_rung.saturating_sub(1);
     let mut settled = None;
     while settled.is_none() && rung < RUNGS {
         let limits = evidence.highest.scaled(0.5_f32.powi(rung as i32));
         let rests = |row: usize| !evidence.awake[row] && limits.hold(&evidence.motions[row]);
-        settled = try_to_settle(bench, &evidence.motions, rests, error)?;
+        settled = try_to_settle(bench, &evidence.motions, rests, error, allowed)?;
         rung += u32::from(settled.is_none());
     }
     bench.state.progress.still_rung = rung.min(RUNGS - 1);
@@ -159,19 +164,20 @@ fn hand_back(bench: &mut Bench<'_>, evidence: &Evidence, error: f64) -> Result<u
     Ok(released)
 }
 
-/// Puts rows to rest where the `error` in the held-out pixels grows by no more than `effects.still_loss`; returns how many and
+/// Puts rows to rest where the `error` in the held-out pixels grows by no more dB than allowed; returns how many and
 /// leaves the new error, or `None`.
 fn try_to_settle(
     bench: &mut Bench<'_>,
     motions: &[Motion],
     wanted: impl Fn(usize) -> bool,
     error: &mut f64,
+    allowed: f64,
 ) -> Result<Option<usize>, TrainError> {
     let mut trial = bench.state.field.clone();
     let found = put_to_rest(&mut trial, motions, wanted);
     if found > 0 {
         let after = bench.error(Some(&trial))?;
-        if gain(after, *error) > f64::from(bench.config().effects.still_loss) {
+        if gain(after, *error) > allowed {
             return Ok(None);
         }
         (bench.state.field, *error) = (trial, after);
