@@ -1,4 +1,4 @@
-//! What a file holds beside the field.
+//! Content of a file besides the field.
 
 use std::collections::BTreeMap;
 

@@ -22,6 +22,7 @@ use rand_pcg::Pcg64Mcg;
 
 use crate::renderers::fast_gradient;
 use crate::support::{Case, Mismatches, compare_with_differences, pixel_discontinuity, render};
+use crate::views;
 
 const BOTH: [Blending; 2] = [Blending::Color, Blending::Own];
 
@@ -224,19 +225,6 @@ fn known_values() {
 /// Relative width of the boundary band: above the rounding of a weight in single precision.
 const BAND: f64 = 1e-3;
 
-/// Many small Gaussians over several tiles, also partial ones.
-fn many() -> SyntheticConfig {
-    SyntheticConfig {
-        seed: 11,
-        gaussians: 250,
-        instances: 6,
-        width: 71,
-        height: 53,
-        screen_size: (0.01, 0.08),
-        ..SyntheticConfig::default()
-    }
-}
-
 /// Results of the reference for a head, with gradients by pixels away from the boundary band.
 struct Expected {
     scene: SyntheticScene,
@@ -382,16 +370,16 @@ mod suite {
     use cif_render::synthetic::SyntheticConfig;
     use cif_render::{InstanceSettings, OccupancySource, RenderSettings};
 
-    use super::{Compare, many, settings};
+    use super::{Compare, settings, views};
 
     pub(super) fn values_of_few_and_many_channels(compare: Compare) {
         for channels in [1, 3, 4, 16, 100, 101] {
-            compare("static", &many(), settings(), channels, &|_| {});
+            compare("static", &views::config(), settings(), channels, &|_| {});
         }
     }
 
     pub(super) fn weights_that_saturate_and_pixels_that_stop(compare: Compare) {
-        let config = SyntheticConfig { gaussians: 60, screen_size: (0.05, 0.4), ..many() };
+        let config = SyntheticConfig { gaussians: 60, screen_size: (0.05, 0.4), ..views::config() };
         compare("saturated", &config, settings(), 3, &|scene| {
             for row in 0..60 {
                 scene.field.gaussians.opacity_logits[row] = if row % 2 == 0 { 7.0 } else { 1.0 };
@@ -405,7 +393,7 @@ mod suite {
             InstanceSettings { occupancy: OccupancySource::Opacity, ..InstanceSettings::default() };
         for antialiased in [false, true] {
             let settings = RenderSettings { antialiased, instances: Some(instances), ..settings() };
-            compare("opacity as occupancy", &many(), settings, 3, &|_| {});
+            compare("opacity as occupancy", &views::config(), settings, 3, &|_| {});
         }
     }
 }
@@ -430,7 +418,7 @@ blend_suite!(on_gpu, super::gpu::check);
 
 #[test]
 fn fast_path_of_a_deformed_scene() {
-    let config = SyntheticConfig { heads: Some(ALL_HEADS), ..many() };
+    let config = SyntheticConfig { heads: Some(ALL_HEADS), ..views::config() };
     check_fast_path("deformed", &config, settings(), 5, &|_| {});
 }
 
@@ -462,7 +450,7 @@ fn head_on(
 
 #[test]
 fn threads_and_memory_do_not_change_a_bit() {
-    let scene = generate(&SyntheticConfig { gaussians: 3000, ..many() });
+    let scene = generate(&SyntheticConfig { gaussians: 3000, ..views::config() });
     for blending in BOTH {
         let head = Head::new(&scene, 7, blending, 1.0);
         let one = head_on(1, u64::MAX, &scene, &head);
@@ -479,7 +467,7 @@ fn threads_and_memory_do_not_change_a_bit() {
 /// After a training pass the same tile lists serve, and pictures have none for gradients.
 #[test]
 fn gradients_follow_a_forward_pass_and_not_a_picture() {
-    let scene = generate(&many());
+    let scene = generate(&views::config());
     let head = Head::new(&scene, 2, Blending::Own, 1.0);
     let (values, v_blended) = (single(&head.values), single(&head.v_blended));
     let mut renderer = Renderer::new(SimdLevel::Auto);
@@ -505,7 +493,7 @@ fn gradients_follow_a_forward_pass_and_not_a_picture() {
 /// Products that are far from 1, but within the range of single precision, are no fault.
 #[test]
 fn large_and_small_values_stay_finite() {
-    let scene = generate(&SyntheticConfig { gaussians: 60, screen_size: (0.05, 0.4), ..many() });
+    let scene = generate(&SyntheticConfig { gaussians: 60, screen_size: (0.05, 0.4), ..views::config() });
     for blending in BOTH {
         for (magnitude, v_magnitude) in [(1e-30, 1.0), (1e30, 1e-3), (1e10, 1e10)] {
             let mut head = Head::new(&scene, 3, blending, magnitude);
@@ -523,7 +511,7 @@ fn large_and_small_values_stay_finite() {
 
 #[test]
 fn scenes_without_gaussians() {
-    let scene = generate(&SyntheticConfig { gaussians: 0, instances: 0, ..many() });
+    let scene = generate(&SyntheticConfig { gaussians: 0, instances: 0, ..views::config() });
     let head = Head::new(&scene, 4, Blending::Color, 1.0);
     let (blended, v_values, _) = head_on(1, u64::MAX, &scene, &head);
     assert!(v_values.is_empty() && blended.values == vec![0.0; 4 * 71 * 53]);
@@ -630,7 +618,7 @@ mod gpu {
     #[test]
     fn gradients_add_up_and_two_runs_give_the_same_bits() {
         let Some(mut device) = device() else { return };
-        let config = SyntheticConfig { gaussians: 3000, screen_size: (0.01, 0.03), ..many() };
+        let config = SyntheticConfig { gaussians: 3000, screen_size: (0.01, 0.03), ..views::config() };
         let expected = expected(&config, settings(), (6, Blending::Color), &[], |_| {});
         let both = [None, Some(GeometryPath::Full)];
         let twice = run(&mut device, &expected, &settings(), &both).unwrap();
@@ -646,7 +634,7 @@ mod gpu {
     #[test]
     fn views_without_gaussians() {
         let Some(mut device) = device() else { return };
-        let config = SyntheticConfig { gaussians: 0, instances: 0, ..many() };
+        let config = SyntheticConfig { gaussians: 0, instances: 0, ..views::config() };
         let expected = expected(&config, settings(), (5, Blending::Color), &[], |_| {});
         let settings = RenderSettings { instances: None, ..settings() };
         let outcome = run(&mut device, &expected, &settings, &[Some(GeometryPath::Full)]).unwrap();

@@ -75,9 +75,9 @@ impl Effect for Still {
     }
 }
 
-/// What tells which Gaussians stand still.
+/// Evidence for which Gaussians stand still.
 struct Evidence {
-    /// What the network does to every Gaussian.
+    /// Motion that the network gives every Gaussian.
     motions: Vec<Motion>,
     /// Motion above which nothing settles.
     highest: Limits,

@@ -65,7 +65,7 @@ pub(super) fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoi
     effects
 }
 
-/// What decisions are made from.
+/// Evidence and settings that decisions are made from.
 struct Plan<'a> {
     found: &'a Evidence,
     config: &'a TrainConfig,

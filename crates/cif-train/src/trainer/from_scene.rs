@@ -1,7 +1,7 @@
 //! Runs that begin with the Gaussians and the deformation of a trained scene: other masks, or another variant
 //! of the instance stage, on one and the same reconstruction.
 
-use cif_dataset::{Dataset, Split, TrainedImages};
+use cif_dataset::{Dataset, MadeFrom, Split, TrainedImages};
 use cif_field::{Checkpoint, Field};
 use cif_geometry::PinholeCamera;
 use cif_geometry::scalar::logit;
@@ -50,7 +50,8 @@ impl Trainer {
         config.effects.instances = true;
         let measured_frames = MeasuredFrames::withhold(&mut dataset, &config);
         let Checkpoint { mut field, training, .. } = scene;
-        check_capture(&field, &dataset)?;
+        let inputs = inputs_of(&dataset);
+        check_capture(&field, &dataset, &inputs)?;
         let mut progress = Progress::at(Stage::Identity);
         let mut state = None;
         let mut has_same_masks = false;
@@ -61,7 +62,7 @@ impl Trainer {
                     return Err(TrainError::Unfinished { scene: name.to_owned(), stage });
                 }
                 Stage::Identity => {
-                    has_same_masks = parsed.is_known_of(&dataset);
+                    has_same_masks = parsed.is_known_of(&dataset, &inputs);
                     progress = parsed.progress;
                     state = Some((training.tensors, parsed.adam_steps));
                 }
@@ -113,7 +114,7 @@ impl Trainer {
 
 /// Refuses a capture that the scene was not trained on: masks, labels and the resolution of images may differ, what was
 /// seen, from where and when may not.
-fn check_capture(field: &Field, dataset: &Dataset) -> Result<(), TrainError> {
+fn check_capture(field: &Field, dataset: &Dataset, inputs: &MadeFrom) -> Result<(), TrainError> {
     let other = |what, expected: String, found: String| {
         Err(TrainError::OtherCapture { what, expected, found, root: dataset.root.clone() })
     };
@@ -144,9 +145,8 @@ fn check_capture(field: &Field, dataset: &Dataset) -> Result<(), TrainError> {
         }
     }
     let trained = field.record.images.clone().and_then(|images| serde_json::from_value(images).ok());
-    let difference = trained.and_then(|trained: TrainedImages| {
-        trained.difference(&TrainedImages::of(dataset, &inputs_of(dataset)))
-    });
+    let difference =
+        trained.and_then(|trained: TrainedImages| trained.difference(&TrainedImages::of(dataset, inputs)));
     match difference {
         Some(difference) => Err(TrainError::ChangedCapture { difference, root: dataset.root.clone() }),
         None => Ok(()),

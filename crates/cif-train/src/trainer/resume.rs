@@ -79,9 +79,8 @@ impl SavedState {
     }
 
     /// True where it is known that the run was of the same capture, masks included.
-    pub(super) fn is_known_of(&self, dataset: &Dataset) -> bool {
-        self.capture.inputs.is_some()
-            && self.capture.check(&Capture::of(dataset, &inputs_of(dataset)), dataset).is_ok()
+    pub(super) fn is_known_of(&self, dataset: &Dataset, inputs: &MadeFrom) -> bool {
+        self.capture.inputs.is_some() && self.capture.check(&Capture::of(dataset, inputs), dataset).is_ok()
     }
 }
 

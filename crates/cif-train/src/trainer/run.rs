@@ -205,7 +205,7 @@ impl Trainer {
         Ok(outcome)
     }
 
-    /// What follows the work of a stage, before the next one begins.
+    /// Measures, sharpens and reports behind the work of a stage, before the next one begins.
     fn end_stage(
         &mut self,
         stage: Stage,

@@ -71,7 +71,7 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
     Ok(result)
 }
 
-/// What Grounded SAM 2 says of the ids of an array.
+/// Description of the ids of an array by Grounded SAM 2.
 #[derive(Deserialize)]
 struct Described {
     #[serde(default)]

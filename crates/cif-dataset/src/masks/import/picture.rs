@@ -1,4 +1,4 @@
-//! What a source holds: objects, and pictures that show them, not decoded yet.
+//! Content of a source: objects, and pictures that show them, not decoded yet.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -44,7 +44,7 @@ impl Place {
     }
 }
 
-/// What a reader lists of a source.
+/// Objects and pictures that a reader lists of a source.
 #[derive(Default)]
 pub(super) struct Listing {
     pub(super) objects: Objects,
@@ -54,7 +54,7 @@ pub(super) struct Listing {
     pub(super) notes: Vec<String>,
 }
 
-/// What a picture consists of.
+/// Parts of a picture.
 pub(super) enum Content {
     /// A file with a value or a colour per pixel.
     Values(PathBuf, Arc<Table>),
@@ -93,7 +93,7 @@ pub(super) struct Matte {
     pub(super) channel: Option<String>,
 }
 
-/// What values and colours of the pictures stand for.
+/// Meaning of the values and colours of the pictures.
 pub(super) enum Table {
     /// Objects by value.
     Values(BTreeMap<u16, usize>),
