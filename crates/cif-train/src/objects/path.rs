@@ -16,7 +16,7 @@ pub(super) const CUT_BY_PLANE: f64 = 20.0;
 pub(super) const MEETING: f64 = 0.3;
 pub(super) const CROSSING: f64 = 0.01;
 
-/// Weight of a time whose masks are cut by the border.
+/// Weight of a time whose masks are all cut by the border.
 const CUT: f64 = 0.05;
 
 /// Distance of a place from between those before and after, in sizes and in usual ones, from which it is aside, and the
@@ -47,8 +47,8 @@ const KINK: f64 = 4.0;
 const LOOSE: f64 = 0.05;
 
 /// The path that stays near `raw` where the object is well seen, and bends little, by its stiffness; `times` of the
-/// whole sequence. Of an object that stays on its support it passes by places that are far aside of
-/// those before and after them, where a mask shows something else as well.
+/// whole sequence. Of an object that one camera sees stay on its support it passes by places that are far aside of those
+/// before and after them, where a mask shows something else as well.
 pub(super) fn smooth(
     raw: &BTreeMap<usize, DVec3>,
     views: &[ObjectView],
@@ -59,11 +59,13 @@ pub(super) fn smooth(
     if keys.len() < 3 {
         return raw.clone();
     }
-    let aside = if outline.air.is_empty() { places_aside(raw, outline.size()) } else { BTreeSet::new() };
+    // Where the rays of several cameras meet it is, however far it jumps.
+    let may_be_wrong = outline.air.is_empty() && outline.stiffness != MEETING;
+    let aside = if may_be_wrong { places_aside(raw, outline.size()) } else { BTreeSet::new() };
     let near = |time: &usize| {
         let of = || views.iter().filter(|view| view.time_index == *time);
         let seen = of().map(|view| view.visible).fold(0.0, f64::max);
-        let cut = if of().any(|view| view.cut) { CUT } else { 1.0 };
+        let cut = if of().all(|view| view.cut) { CUT } else { 1.0 };
         let weight = if aside.contains(time) { 0.0 } else { seen * seen * cut } + 1e-4;
         (DMat3::IDENTITY * weight, weight * raw[time])
     };
@@ -244,7 +246,7 @@ fn bend(keys: &[usize], path: &BTreeMap<usize, DVec3>, k: usize) -> DVec3 {
 mod tests {
     use glam::{DQuat, DVec2};
 
-    use super::super::testing::{TIMES, jumping, solid, sphere_places, views};
+    use super::super::testing::{TIMES, jumping, rig, solid, sphere_places, views};
     use super::*;
 
     #[test]
@@ -259,6 +261,19 @@ mod tests {
         }
         // Fast, but not aside.
         assert!(places_aside(&(0..20).map(bends).collect(), 0.05).is_empty());
+    }
+
+    #[test]
+    fn where_several_rays_meet_nothing_is_aside() {
+        // At rest, but for one bounce; a camera is cut by its border.
+        let up = |time: usize| if time == 12 { 0.2 } else { 0.05 };
+        let truth: Vec<(DQuat, DVec3)> =
+            (0..TIMES).map(|time| (DQuat::IDENTITY, DVec3::new(0.0, 0.0, up(time)))).collect();
+        let mut views = views(solid(&sphere_places(0.05), |_| [0.8, 0.5, 0.2], 0.006), &truth, rig);
+        views.iter_mut().step_by(5).for_each(|view| view.cut = true);
+        let outline = super::super::outline::outlines(&views, None, TIMES).remove(0);
+        let path = smooth(&outline.path, &views, TIMES, &outline);
+        assert!((path[&12] - truth[12].1).length() < 0.03, "{:?}", path[&12]);
     }
 
     /// Place of a ball that bounces.
