@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use glam::{DMat2, DVec2, DVec3};
 
+use super::height::height_of_path;
 use super::path;
 use super::plane::Plane;
 use super::view::{ObjectView, WITHIN, are_discs, is_one_camera, median};
@@ -42,6 +43,9 @@ const TOPPLES: f64 = 1.5;
 
 /// Visible share from which a mask tells how high it is.
 const MOSTLY_SEEN: f64 = 0.6;
+
+/// Visible share from which what touches a mask is behind it.
+const FULLY_SEEN: f64 = 0.9;
 
 /// Length of a mask in its widths from which it is that of a bar, and the sine of the angle between its long axis and
 /// the way down from which the bar lies.
@@ -152,7 +156,7 @@ enum Stance {
 /// lower fell over: pictures decide. Where it sees the object from other sides soon after, rays that cross tell the path
 /// of what leaves the plane. `times` are those of the sequence.
 pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize) -> Vec<Outline> {
-    let on_plane = |stance: Stance| plane.and_then(|plane| on_plane(views, plane, stance));
+    let on_plane = |stance: Stance| plane.and_then(|plane| on_plane(views, (plane, times), stance));
     let met = meetings(views);
     if !met.is_empty() {
         let on_plane = on_plane(Stance::MayLeave);
@@ -243,8 +247,9 @@ fn meetings(views: &[ObjectView]) -> BTreeMap<usize, DVec3> {
 
 /// Outline of the views of an object on a plane; `None` where no mask is seen from above, or nothing tells that it moves
 /// in this way.
-fn on_plane(views: &[ObjectView], plane: &Plane, stance: Stance) -> Option<Outline> {
-    let whole: Vec<&ObjectView> = match views.iter().filter(|view| view.is_whole()).collect::<Vec<_>>() {
+fn on_plane(views: &[ObjectView], (plane, times): (&Plane, usize), stance: Stance) -> Option<Outline> {
+    let is_whole = |view: &&ObjectView| view.is_whole() || (!view.cut && view.visible >= FULLY_SEEN);
+    let whole: Vec<&ObjectView> = match views.iter().filter(is_whole).collect::<Vec<_>>() {
         whole if !whole.is_empty() => whole,
         _ => match views.iter().filter(|view| !view.cut).collect::<Vec<_>>() {
             uncut if !uncut.is_empty() => uncut,
@@ -280,6 +285,8 @@ fn on_plane(views: &[ObjectView], plane: &Plane, stance: Stance) -> Option<Outli
     if stance == Stance::Topples {
         heights = steady_heights(views, plane, medians.height)?;
         medians.height = heights.iter().copied().fold(0.0, f64::max);
+    } else if !leaves && is_one_camera(views) {
+        heights.fill(height_of_path(medians.height, &whole, plane, times));
     }
     let mut sums: BTreeMap<usize, (DVec3, f64, bool)> = BTreeMap::new();
     for ((view, size), height) in views.iter().zip(steady_sizes(views, plane, medians.height)).zip(heights) {
@@ -485,6 +492,25 @@ mod tests {
             views(solid(&sphere_places(RADIUS), |_| [0.8, 0.5, 0.2], 0.006), &[rests; TIMES], cameras);
         all.retain(|view| view.time_index < times);
         all
+    }
+
+    #[test]
+    fn what_touches_whole_masks_is_behind_them() {
+        // Lifted off the floor while nothing touches its mask, and seen beside something where it stands.
+        let up = |time: usize| 0.12 * ((time as f64 - 8.0) / 3.0).clamp(0.0, 1.0);
+        let place = |time: usize| DVec3::new(0.004 * time as f64 - 0.05, 0.0, RADIUS + up(time));
+        let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(|time| (DQuat::IDENTITY, place(time))).collect();
+        let mut views = views(solid(&sphere_places(RADIUS), |_| [0.8, 0.5, 0.2], 0.006), &truth, moving);
+        views.iter_mut().filter(|view| view.time_index < 12).for_each(|view| view.touched = 0.3);
+        let error = |views: &[ObjectView]| {
+            let found = on_plane(views, (&FLOOR, TIMES), Stance::MayLeave).unwrap();
+            let errors = found.path.iter().map(|(time, centre)| (*centre - place(*time)).length());
+            errors.fold(0.0, f64::max)
+        };
+        assert!(error(&views) < 0.03, "{} m", error(&views));
+        // Hidden in part, they do not tell its size.
+        views.iter_mut().filter(|view| view.time_index < 12).for_each(|view| view.visible = 0.6);
+        assert!(error(&views) > 0.1, "{} m", error(&views));
     }
 
     #[test]
