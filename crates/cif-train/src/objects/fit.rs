@@ -60,6 +60,8 @@ pub(super) struct Fit<'a> {
     /// Times at which it may be off the plane.
     pub(super) air: Vec<usize>,
     pub(super) moments: BTreeMap<usize, PoseMoments>,
+    /// Runs of times that share a pose.
+    pub(super) runs: Vec<Vec<usize>>,
 }
 
 /// Moments of turns and translations.
@@ -161,6 +163,7 @@ impl<'a> Fit<'a> {
             stays: false,
             air: outline.air.clone(),
             moments: BTreeMap::new(),
+            runs: Vec::new(),
         }
     }
 
@@ -182,6 +185,11 @@ impl<'a> Fit<'a> {
     pub(super) fn trial_level(&self) -> usize {
         let levels = self.levels();
         levels[levels.len().saturating_sub(2)]
+    }
+
+    /// Times that share the pose of one; none where it has its own.
+    pub(super) fn run(&self, time: usize) -> &[usize] {
+        self.runs.iter().find(|run| run.contains(&time)).map_or(&[], Vec::as_slice)
     }
 
     /// Times before and after one that have poses.
@@ -215,6 +223,9 @@ impl<'a> Fit<'a> {
     ) {
         let view = &self.views[view];
         let mut gradient = shape.loss(&view.crops[level], pose, GREY, view.visible as f32, true).pose;
+        if view.is_sliver() {
+            gradient.turn = DVec3::ZERO;
+        }
         gradient.translation += self.depth(view, pose);
         if let Some((of_pose, _)) = self.contact(shape, view.time_index, pose) {
             gradient.turn += of_pose.turn;
@@ -254,7 +265,10 @@ impl<'a> Fit<'a> {
         let Some(pose) = self.poses.get(&time).copied() else { return };
         let background = std::array::from_fn(|_| self.rng.random::<f32>());
         let weight = view.visible as f32;
-        let loss = self.shape.loss(&view.crops[level], &pose, background, weight, true);
+        let mut loss = self.shape.loss(&view.crops[level], &pose, background, weight, true);
+        if view.is_sliver() {
+            loss.pose.turn = DVec3::ZERO;
+        }
         let mut gradients = BTreeMap::from([(time, loss.pose)]);
         gradients.entry(time).or_default().translation += self.depth(view, &pose);
         self.accelerate(time, &mut gradients);
@@ -275,6 +289,10 @@ impl<'a> Fit<'a> {
             let moved = self.moved(view, pose, &gradient, &mut moments, pose_rate);
             self.moments.insert(time, moments);
             self.poses.insert(time, moved);
+        }
+        let pose = self.poses[&time];
+        for other in self.run(time).to_vec() {
+            self.poses.insert(other, pose);
         }
     }
 
@@ -309,7 +327,7 @@ impl<'a> Fit<'a> {
         };
         Pose {
             rotation: (DQuat::from_scaled_axis(turn) * pose.rotation).normalize(),
-            translation: pose.translation + shift,
+            translation: self.stood(view, pose.translation + shift),
         }
     }
 

@@ -2,7 +2,7 @@
 //! the times behind them comes back.
 
 use super::fit::{Fit, log, onward};
-use super::shape::Pose;
+use super::shape::{Pose, Shape};
 use super::view::median;
 use crate::error::TrainError;
 use crate::phases::Phases;
@@ -82,7 +82,7 @@ fn march(fit: &mut Fit<'_>, times: &[usize], known: &[usize]) {
     let mut is_even = false;
     for time in times.iter().copied() {
         let guesses = led(time, &run);
-        let Some((present, found, pose)) = settled(fit, time, &guesses) else {
+        let Some((present, found, pose)) = compared(fit, time, &guesses) else {
             // It does not tell: onward to those that do.
             run.extend(guesses.last().map(|pose| (time, *pose)));
             continue;
@@ -121,22 +121,32 @@ fn led(time: usize, run: &[(usize, Pose)]) -> Vec<Pose> {
 
 /// Losses of a time in its present pose, and in the best of those that guesses lead to, and that pose; `None` where the
 /// time does not tell.
-fn settled(fit: &Fit<'_>, time: usize, guesses: &[Pose]) -> Option<(f64, f64, Pose)> {
-    let level = fit.trial_level();
+fn compared(fit: &Fit<'_>, time: usize, guesses: &[Pose]) -> Option<(f64, f64, Pose)> {
     let is_told = |view: &usize| fit.views[*view].time_index == time && fit.views[*view].visible >= TOLD;
     let views: Vec<usize> = (0..fit.views.len()).filter(is_told).collect();
+    let (found, pose) = settled(fit, &views, guesses, guesses.len())?;
+    let present = loss(fit, &mut fit.shape.copied(), &views, fit.poses.get(&time)?);
+    Some((present, found, pose))
+}
+
+/// The best of some poses by their loss on views of a time, which is given too, after so many of them that explain most
+/// were moved onto these; `None` without views.
+pub(super) fn settled(fit: &Fit<'_>, views: &[usize], guesses: &[Pose], tried: usize) -> Option<(f64, Pose)> {
     if views.is_empty() {
         return None;
     }
     let mut shape = fit.shape.copied();
-    let loss = |shape: &mut _, pose: &Pose| -> f64 {
-        views.iter().map(|view| fit.loss_with(shape, *view, level, pose)).sum()
-    };
-    let present = loss(&mut shape, fit.poses.get(&time)?);
-    let found = guesses.iter().map(|guess| {
-        let pose = fit.settled(&mut shape, &views, level, *guess, SETTLE);
-        (loss(&mut shape, &pose), pose)
+    let mut begun: Vec<(f64, Pose)> =
+        guesses.iter().map(|guess| (loss(fit, &mut shape, views, guess), *guess)).collect();
+    begun.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let found = begun.into_iter().take(tried).map(|(_, guess)| {
+        let pose = fit.settled(&mut shape, views, fit.trial_level(), guess, SETTLE);
+        (loss(fit, &mut shape, views, &pose), pose)
     });
-    let (found, pose) = found.min_by(|a, b| a.0.total_cmp(&b.0))?;
-    Some((present, found, pose))
+    found.min_by(|a, b| a.0.total_cmp(&b.0))
+}
+
+/// Loss of a shape on views in a pose.
+fn loss(fit: &Fit<'_>, shape: &mut Shape, views: &[usize], pose: &Pose) -> f64 {
+    views.iter().map(|view| fit.loss_with(shape, *view, fit.trial_level(), pose)).sum()
 }

@@ -13,6 +13,7 @@
 //! | `texture`, `ball`, `sphere` | how it turns, where its outline does not tell |
 //! | `ways` | which ways of moving are tried |
 //! | `follow` | how it moves from time to time |
+//! | `grow` | where it is when little of it is seen |
 //! | `mend` | which of its poses jump, and where they belong |
 //! | `trials` | which way is kept |
 //! | `bend` | whether it rather deforms |
@@ -25,6 +26,7 @@ mod below;
 mod bend;
 mod fit;
 mod follow;
+mod grow;
 mod height;
 mod known;
 mod mend;

@@ -1,5 +1,6 @@
 //! Height, size and path of an object from the outlines of its masks and the plane it stands on.
 
+use std::cmp::Ordering;
 use std::collections::BTreeMap;
 
 use glam::{DMat2, DVec2, DVec3};
@@ -7,7 +8,7 @@ use glam::{DMat2, DVec2, DVec3};
 use super::height::height_of_path;
 use super::path;
 use super::plane::Plane;
-use super::view::{ObjectView, WITHIN, are_discs, is_one_camera, median};
+use super::view::{ObjectView, WITHIN, are_discs, is_one_camera, median, rests};
 use crate::tracks::nearest_to_rays;
 
 /// Largest apparent size of a mask, relative to that on the plane, at which its object is taken to touch the plane.
@@ -57,7 +58,7 @@ const LOWEST: usize = 8;
 const STANDS: (f64, f64) = (0.4, 1.5);
 
 /// Height above that at which it stands, of that of its outline, from which an object is off its support.
-const RAISED: f64 = 0.2;
+pub(super) const RAISED: f64 = 0.2;
 
 /// Room that an object has around its height and radius, of them.
 const ROOM: f64 = 1.1;
@@ -78,6 +79,10 @@ pub(super) struct Outline {
     pub(super) stiffness: f64,
     /// True where views of several sides, of one time or of few, tell where it is.
     pub(super) is_surrounded: bool,
+    /// Times at which the rays of several cameras do not meet, though it stands: it rests, or does beside them.
+    pub(super) held: Vec<usize>,
+    /// Those at which they do not, and nothing tells that it stands: its place is a guess.
+    pub(super) guessed: Vec<usize>,
     /// True of what is tried only where no other outline explains what is seen: a plane tells depths better than few
     /// rays.
     pub(super) is_resort: bool,
@@ -200,17 +205,63 @@ fn surrounded(
         air: Vec::new(),
         stiffness,
         is_surrounded: true,
+        held: Vec::new(),
+        guessed: Vec::new(),
         is_resort: false,
     });
     if stiffness == path::MEETING
-        && let Some(height) = plane.and_then(|plane| standing_height(&met, plane, outline.height))
+        && let Some(plane) = plane
+        && let Some(height) = standing_height(&met, plane, outline.height)
     {
         outline.height = height;
+        stand(&mut outline, views, plane, &met);
+    }
+    if stiffness == path::MEETING {
+        guess(&mut outline, views, &met);
     }
     (outline.stiffness, outline.is_surrounded) = (stiffness, true);
     outline.air.clear();
     outline.path.extend(met);
     outline
+}
+
+/// Puts an object that few of several cameras see where it stands: at times beside which it does where their rays meet, and
+/// at those at which it rests.
+fn stand(outline: &mut Outline, views: &[ObjectView], plane: &Plane, met: &BTreeMap<usize, DVec3>) {
+    let stands =
+        |(_, centre): (&usize, &DVec3)| (plane.height(*centre) / outline.height - 1.0).abs() < RAISED;
+    let beside = |time: usize| {
+        met.range(..time).next_back().is_none_or(stands) && met.range(time..).next().is_none_or(stands)
+    };
+    let held = outline.path.keys().copied().filter(|time| !met.contains_key(time));
+    let held: Vec<usize> = held.filter(|time| beside(*time) || rests(views, *time)).collect();
+    for time in &held {
+        let largest = views
+            .iter()
+            .filter(|view| view.time_index == *time)
+            .max_by(|a, b| (!a.cut, a.area()).partial_cmp(&(!b.cut, b.area())).unwrap_or(Ordering::Equal));
+        let place = largest.and_then(|view| {
+            let (origin, ray) = (view.camera.centre(), view.camera.ray(view.centroid));
+            Some(origin + plane.meet(origin, ray, outline.height)? * ray)
+        });
+        outline.path.extend(place.map(|place| (*time, place)));
+    }
+    outline.held = held;
+}
+
+/// Puts an object about where the rays of masks meet that the border cuts, at times at which nothing else tells.
+fn guess(outline: &mut Outline, views: &[ObjectView], met: &BTreeMap<usize, DVec3>) {
+    let is_known = |time: &usize| met.contains_key(time) || outline.held.contains(time);
+    let weight = |view: &ObjectView| view.visible.powi(2) * if view.cut { path::CUT } else { 1.0 } + 1e-4;
+    outline.guessed = outline.path.keys().copied().filter(|time| !is_known(time)).collect();
+    for time in &outline.guessed {
+        let at: Vec<&ObjectView> = views.iter().filter(|view| view.time_index == *time).collect();
+        if at.len() > 1
+            && let Some(place) = meeting_point(at.into_iter().map(|view| (view, weight(view))))
+        {
+            outline.path.insert(*time, place);
+        }
+    }
 }
 
 /// Times at which an object on a known path is not as low as it stands; all, where it may never stand: as the height of
@@ -224,11 +275,14 @@ fn raised(outline: &Outline, plane: &Plane) -> Vec<usize> {
 }
 
 /// Height above the plane at which an object stands whose centres are known: the middle one of times that are about as low
-/// as its lowest ones. `None` where these are few, or far from what its outlines tell, so that it may never stand.
+/// as its lowest ones. `None` where these are few and differ, or far from what its outlines tell, so that it may never stand.
 fn standing_height(met: &BTreeMap<usize, DVec3>, plane: &Plane, told: f64) -> Option<f64> {
     let mut heights: Vec<f64> = met.values().map(|centre| plane.height(*centre)).collect();
     heights.sort_by(f64::total_cmp);
-    let low = *heights.get(heights.len() / LOWEST).filter(|_| heights.len() >= LOWEST)?;
+    let [lowest, highest] = [*heights.first()?, *heights.last()?];
+    // Few tell it where all are as high.
+    let are_alike = heights.len() >= SHORTEST_RUN && highest < ROOM * lowest;
+    let low = *heights.get(heights.len() / LOWEST).filter(|_| heights.len() >= LOWEST || are_alike)?;
     heights.retain(|height| *height < ROOM * low);
     let height = median(&mut heights);
     (STANDS.0 * told..STANDS.1 * told).contains(&height).then_some(height)
@@ -315,6 +369,8 @@ fn on_plane(views: &[ObjectView], (plane, times): (&Plane, usize), stance: Stanc
         path: sums.into_iter().map(|(time, (sum, weight, _))| (time, sum / weight)).collect(),
         stiffness: path::CUT_BY_PLANE,
         is_surrounded: false,
+        held: Vec::new(),
+        guessed: Vec::new(),
         is_resort: false,
     })
 }
@@ -514,6 +570,20 @@ mod tests {
     }
 
     #[test]
+    fn what_one_of_several_cameras_sees_stands_where_it_is_between_meetings() {
+        let place = |time: usize| DVec3::new(0.006 * time as f64 - 0.09, 0.0, RADIUS);
+        let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(|time| (DQuat::IDENTITY, place(time))).collect();
+        let mut views = views(solid(&sphere_places(RADIUS), |_| [0.8, 0.5, 0.2], 0.006), &truth, rig);
+        let camera = views[0].camera_key;
+        views.retain(|view| view.time_index > 5 || view.camera_key == camera);
+        let found = outlines(&views, Some(&FLOOR), TIMES).remove(0);
+        assert_eq!(found.held, (0..6).collect::<Vec<_>>());
+        for time in 0..6 {
+            assert!((found.path[&time] - place(time)).length() < 0.004, "{:?}", found.path[&time]);
+        }
+    }
+
+    #[test]
     fn rays_that_miss_the_others_do_not_move_the_point() {
         let mut views = ball(1, rig);
         let point = |views: &[ObjectView]| meeting_point(views.iter().map(|view| (view, 1.0))).unwrap();
@@ -581,7 +651,9 @@ mod tests {
         assert!((found - 0.05).abs() < 5e-4, "{found}");
         // Too high to stand, by its outlines; too few times.
         assert_eq!(standing_height(&met, &FLOOR, 0.02), None);
-        assert_eq!(standing_height(&(0..5).map(lifted).collect(), &FLOOR, 0.07), None);
+        assert_eq!(standing_height(&(4..10).map(lifted).collect(), &FLOOR, 0.07), None);
+        // Unless all are as high.
+        assert_eq!(standing_height(&(0..5).map(lifted).collect(), &FLOOR, 0.07), Some(0.05));
         // Outlines of a ball tell its height worse than the places where its rays meet.
         let found = outlines(&ball(TIMES, rig), Some(&FLOOR), TIMES).remove(0);
         assert!((found.height - RADIUS).abs() < 0.002, "{}", found.height);

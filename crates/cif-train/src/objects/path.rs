@@ -17,7 +17,7 @@ pub(super) const MEETING: f64 = 0.3;
 pub(super) const CROSSING: f64 = 0.01;
 
 /// Weight of a time whose masks are all cut by the border.
-const CUT: f64 = 0.05;
+pub(super) const CUT: f64 = 0.05;
 
 /// Distance of a place from between those before and after, in sizes and in usual ones, from which it is aside, and the
 /// largest share of such places.

@@ -9,8 +9,9 @@ use cif_render::PoseGradient;
 use glam::DVec3;
 
 use super::fit::{Fit, log};
+use super::outline::RAISED;
 use super::shape::{Pose, Shape};
-use super::view::ObjectView;
+use super::view::{ObjectView, median};
 
 /// Weight of accelerations and changes of turning, where an object is hardly seen.
 const ACCELERATION: f64 = 0.02;
@@ -78,6 +79,30 @@ impl Fit<'_> {
         let ray = view.camera.ray(view.centroid).normalize();
         let size = self.size();
         2.0 * DEPTH * ray.dot(pose.translation - *place) / (size * size) * ray
+    }
+
+    /// A place moved to the height at which it stands where several cameras see it, at times at which it stands and they do
+    /// not: along the ray of the camera that alone sees it, which leaves where it is in the image, else straight up or
+    /// down.
+    pub(super) fn stood(&self, view: &ObjectView, place: DVec3) -> DVec3 {
+        let held = &self.outline.held;
+        let Some(plane) = self.plane.filter(|_| !self.stays && held.contains(&view.time_index)) else {
+            return place;
+        };
+        let met = self.poses.iter().filter(|(time, _)| !held.contains(time));
+        let heights = met.map(|(_, pose)| plane.height(pose.translation));
+        let stands = |height: &f64| (height / self.outline.height - 1.0).abs() < RAISED;
+        let mut heights: Vec<f64> = heights.filter(stands).collect();
+        if heights.is_empty() {
+            return place;
+        }
+        let height = median(&mut heights);
+        let origin = view.camera.centre();
+        let is_alone = self.views.iter().filter(|other| other.time_index == view.time_index).count() == 1;
+        match plane.meet(origin, place - origin, height).filter(|_| is_alone) {
+            Some(share) => origin + share * (place - origin),
+            None => place + (height - plane.height(place)) * plane.normal,
+        }
     }
 
     /// True where it is held to its support, as nothing else tells its distance: neither several cameras nor rays of one

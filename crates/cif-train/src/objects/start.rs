@@ -11,8 +11,9 @@ use rand_pcg::Pcg64;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::fit::{Fit, Turns, between, hull};
+use super::fit::{Fit, Turns, hull};
 use super::follow::follow;
+use super::grow::grow;
 use super::mend::mend;
 use super::order::Order;
 use super::outline::{Outline, meeting_point};
@@ -53,9 +54,6 @@ const JOINT: usize = 2500;
 
 /// Share of the way that training may move the pose of a time which shows an object whole.
 const LEAST_SHARE: f64 = 0.1;
-
-/// Pose-only steps of a time that is added.
-const ADDED: usize = 30;
 
 /// An object with its motion.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -233,7 +231,9 @@ impl<'a> Object<'a> {
     pub(super) fn begun(self) -> Result<Option<Started<'a>>, TrainError> {
         let Object { views, outline, .. } = self;
         let path = smooth(&outline.path, views, self.surroundings.times, outline);
-        let reliable: Vec<usize> = self.views_at(&path).filter(|view| views[*view].is_reliable()).collect();
+        let is_reliable =
+            |view: &usize| views[*view].is_reliable() && !outline.guessed.contains(&views[*view].time_index);
+        let reliable: Vec<usize> = self.views_at(&path).filter(is_reliable).collect();
         let mut good: Vec<usize> = reliable.iter().map(|view| views[*view].time_index).collect();
         good.dedup();
         if good.len() < FEWEST_TIMES {
@@ -402,32 +402,5 @@ fn roll_along(fit: &mut Fit<'_>, plane: &Plane, radius: f64) {
     let rotations = rolled(&places, plane.normal, radius);
     for ((pose, rotation), translation) in fit.poses.values_mut().zip(rotations).zip(places) {
         *pose = Pose { rotation, translation };
-    }
-}
-
-/// Adds the times that are seen, but not reliable, nearest first.
-pub(super) fn grow(fit: &mut Fit<'_>, path: &BTreeMap<usize, DVec3>) {
-    let known: Vec<usize> = fit.poses.keys().copied().collect();
-    let mut rest: Vec<usize> = path.keys().copied().filter(|time| !fit.poses.contains_key(time)).collect();
-    rest.sort_by_key(|time| known.iter().map(|known| known.abs_diff(*time)).min());
-    // Between times at which it may be off its support, it may.
-    let is_off = |time: Option<&usize>| time.is_none_or(|time| fit.air.contains(time));
-    let beside = |time: usize| {
-        let after = known.partition_point(|known| *known < time);
-        is_off(known[..after].last()) && is_off(known.get(after))
-    };
-    let off: Vec<usize> =
-        rest.iter().copied().filter(|time| !fit.air.contains(time) && beside(*time)).collect();
-    fit.air.extend(off);
-    for time in rest {
-        let views: Vec<usize> =
-            (0..fit.views.len()).filter(|view| fit.views[*view].time_index == time).collect();
-        let Some(pose) = fit.pose_at(time) else { continue };
-        fit.poses.insert(time, between(&pose, &pose, 0.0));
-        let seen = views.iter().map(|view| fit.views[*view].visible).fold(0.0, f64::max);
-        let level = *fit.levels().first().unwrap_or(&0);
-        for step in 0..if seen > 0.1 { ADDED } else { 0 } {
-            fit.step(views[step % views.len()], level.min(1), None, 0.5);
-        }
     }
 }

@@ -161,6 +161,8 @@ pub(super) fn shaped(
         air: Vec::new(),
         stiffness: 1.0,
         is_surrounded: false,
+        held: Vec::new(),
+        guessed: Vec::new(),
         is_resort: false,
     }
 }

@@ -9,11 +9,12 @@ use glam::{DQuat, DVec3};
 use rand::RngExt;
 
 use super::bend;
+use super::grow::grow;
 use super::mend::mend;
 use super::outline;
 use super::plane::{self, Plane};
 use super::shape::Pose;
-use super::start::{Fitted, Object, fit_object, grow};
+use super::start::{Fitted, Object, fit_object};
 use super::testing::{
     Cameras, FLOOR, TIMES, camera, jumping, moving, patches, rig, solid, sphere_places, views,
     views_in_masks, views_of_groups, with_objects,
@@ -158,6 +159,32 @@ fn what_comes_to_rest_as_soon_as_it_is_seen_is_followed_to_the_border() {
     let errors: Vec<f64> =
         early.map(|(time, shift)| (shift - (truth[*time].1 - truth[TIMES - 1].1)).length()).collect();
     assert!(errors.len() == 3 && errors.iter().all(|error| *error < 0.02), "{errors:?}");
+}
+
+/// Seen by one of several cameras, whose border cuts it, where it rests before it goes.
+#[test]
+fn what_one_camera_sees_a_part_of_is_found_where_it_is() {
+    let place = |time: usize| DVec3::new((0.02 * (time as f64 - 8.0)).clamp(0.0, 0.24) - 0.1, 0.0, 0.045);
+    let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(|time| (DQuat::IDENTITY, place(time))).collect();
+    let mut views = views(solid(&sphere_places(0.045), patches, 0.006), &truth, rig);
+    let camera = views[0].camera_key;
+    views.retain(|view| view.time_index > 11 || view.camera_key == camera);
+    for view in views.iter_mut().filter(|view| view.time_index <= 11) {
+        (view.cut, view.visible) = (true, 0.05);
+    }
+    with_objects(Some(&FLOOR), &views, |objects| {
+        let pose = |time: usize| Pose { rotation: truth[time].0, translation: truth[time].1 };
+        let poses: BTreeMap<usize, Pose> = (12..TIMES).map(|time| (time, pose(time))).collect();
+        let shape = objects[0].hull(&poses, 150, &mut objects[0].rng()).unwrap();
+        let mut fit = objects[0].fit(poses, shape, objects[0].rng());
+        let known: Vec<usize> = (0..views.len()).filter(|view| views[*view].time_index > 11).collect();
+        fit.steps(&known, 200, |_| (1.0, 0.0, 0));
+        grow(&mut fit, &objects[0].outline.path);
+        for time in 0..12 {
+            let error = (fit.poses[&time].translation - place(time)).length();
+            assert!(error < 0.006, "{time}: {error} m");
+        }
+    });
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! An object as one frame shows it: a crop around its mask, at several resolutions.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashSet};
 use std::f64::consts::PI;
 use std::sync::Arc;
 
@@ -23,6 +23,15 @@ const COLOR_SHARE: f32 = 0.3;
 
 /// Share of the pixels of a mask that lie within its radius of its middle.
 pub(super) const WITHIN: f64 = 0.98;
+
+/// Share of the outline of a mask that touches others up to which nothing hides it, and visible share of a hidden one up
+/// to which its place in the image is that of what hides it.
+const WHOLE_TOUCHED: f64 = 0.1;
+const SLIVER: f64 = 0.1;
+
+/// Pixels of a mask that change, of its area, and mean change of its colours, in [0, 1], up to which nothing moved: of
+/// what rests in rendered captures colours change by up to 0.045, of what moves by 0.06 and more.
+const SAME: (f64, f64) = (0.02, 0.05);
 
 /// Share of a whole mask in the disc around its middle from which it is that of a ball.
 const DISC: f64 = 0.9;
@@ -139,12 +148,39 @@ impl ObjectView {
 
     /// True where the outline is the object's own.
     pub(super) fn is_whole(&self) -> bool {
-        !self.cut && self.touched < 0.1
+        !self.cut && self.touched < WHOLE_TOUCHED
     }
 
     /// True where the mask may move a pose.
     pub(super) fn is_reliable(&self) -> bool {
         !self.cut && self.visible > 0.5
+    }
+
+    /// True where the mask tells where the object is: enough of it is seen, or the border alone hides the rest.
+    pub(super) fn tells_place(&self) -> bool {
+        !self.is_sliver() || (self.cut && self.touched < WHOLE_TOUCHED)
+    }
+
+    /// True of a mask that shows too little of what others hide, or the border cuts, to tell how the object is turned.
+    pub(super) fn is_sliver(&self) -> bool {
+        self.visible < SLIVER
+    }
+
+    /// True where a camera that stays in place sees the same as at another time.
+    fn looks_as(&self, other: &Self) -> bool {
+        if self.camera_key != other.camera_key {
+            return false;
+        }
+        let others: HashSet<[u32; 2]> = other.pixels.iter().copied().collect();
+        let both: Vec<[u32; 2]> =
+            self.pixels.iter().copied().filter(|pixel| others.contains(pixel)).collect();
+        let apart = (self.pixels.len() - both.len()) + (others.len() - both.len());
+        let change = |[x, y]: &[u32; 2]| {
+            let (a, b) = (self.frame.image.at(*x, *y), other.frame.image.at(*x, *y));
+            (0..3).map(|k| f64::from(a[k].abs_diff(b[k]))).sum::<f64>() / (3.0 * 255.0)
+        };
+        let changes: f64 = both.iter().map(change).sum();
+        apart as f64 <= SAME.0 * self.area() && changes <= SAME.1 * both.len() as f64
     }
 
     /// Finding where a point of the world is seen.
@@ -186,6 +222,19 @@ pub(super) fn set_visible(views: &mut [ObjectView]) {
         let mut near: Vec<f64> = nearest.into_iter().take(5).map(|(.., area)| area).collect();
         view.visible = (view.area() / median(&mut near)).min(1.0);
     }
+}
+
+/// True where all cameras see the same at two times.
+pub(super) fn look_alike(views: &[ObjectView], a: usize, b: usize) -> bool {
+    let at = |time: usize| views.iter().filter(move |view| view.time_index == time);
+    at(a).count() == at(b).count() && at(a).all(|view| at(b).any(|other| view.looks_as(other)))
+}
+
+/// True where all cameras see the same at a time as at that before or after it at which any sees it.
+pub(super) fn rests(views: &[ObjectView], time: usize) -> bool {
+    let before = views.iter().map(|view| view.time_index).filter(|other| *other < time).max();
+    let after = views.iter().map(|view| view.time_index).filter(|other| *other > time).min();
+    [before, after].into_iter().flatten().any(|other| look_alike(views, time, other))
 }
 
 /// True with one view at most of every time.
