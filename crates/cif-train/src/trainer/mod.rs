@@ -9,6 +9,7 @@
 //! | `step` | how a step is done, and what falls behind it |
 //! | `heads` | what heads of other systems see and change between steps |
 //! | `guidance` | how travelling objects start on the paths that masks tell |
+//! | `seeds` | what objects begin with that nothing was made of |
 //! | `objects`, `parts` | which objects move as a whole or in a part, and how they join the field |
 //! | `identity` | how identity rows come about |
 //! | `shares` | how much of a Gaussian is of any instance |
@@ -55,6 +56,7 @@ mod provenance;
 mod resume;
 mod run;
 mod saving;
+mod seeds;
 #[cfg(feature = "wgpu")]
 mod shape;
 mod shares;
