@@ -13,6 +13,7 @@
 //! | `objects`, `parts` | which objects move as a whole or in a part, and how they join the field |
 //! | `identity` | how identity rows come about |
 //! | `shares` | how much of a Gaussian is of any instance |
+//! | `contradicted` | which Gaussians masks show to be of no instance |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
 //! | `resume` | what is saved, and how a run resumes |
 //! | `evaluate` | what a run has reached, on a few frames |
@@ -27,6 +28,7 @@
 //! threads.
 
 mod backend;
+mod contradicted;
 mod eta;
 mod evaluate;
 mod from_scene;
