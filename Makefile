@@ -34,7 +34,7 @@ BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13 b
 # One interpreter for every build, or PyO3 is built again.
 export PYO3_PYTHON := $(abspath $(BIN)/python)
 
-.PHONY: help build wheel demo plugin stubs docs test test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-simready test-blender test-capture fuzz lint format clean
+.PHONY: help build wheel demo plugin stubs docs test test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-simready test-blender test-capture fuzz lint lint-format format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
@@ -177,9 +177,12 @@ test-blender:
 		$$folder/bin/python -m pytest --noconftest tests/python/test_blender_scene.py; \
 	done
 
-lint: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
-	cargo fmt --all --check
+lint: lint-format
 	cargo clippy --locked --workspace --all-targets -- -D warnings
+
+# What needs no build: CI lints the Rust while it builds the tests.
+lint-format: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
+	cargo fmt --all --check
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 

@@ -58,9 +58,9 @@ pub fn run<S: AsRef<OsStr>>(program: &str, folder: &Path, arguments: impl IntoIt
     Run::from(&command.output().expect("the program starts"))
 }
 
-/// Settings of a small model, for runs whose quality does not matter.
-pub const SMALL_MODEL: &str =
-    "--set model.spatial_resolution=[8,8,8] --set model.width=16 --set model.channels=4";
+/// Settings of a small model without fits of objects, for runs whose quality does not matter.
+pub const SMALL_MODEL: &str = "--set model.spatial_resolution=[8,8,8] --set model.width=16 --set model.channels=4 \
+                               --set motion.rigid=false --set motion.parts=false --set motion.rehearsal=20";
 
 /// Runs `program` in `folder` with the words of a line, split at blanks.
 ///

@@ -50,6 +50,11 @@ impl MaskRow {
         self.border > 0
     }
 
+    /// Its area over its border, pixels: half the width of a strip.
+    pub(crate) fn half_width_px(&self) -> f64 {
+        f64::from(self.pixels) / f64::from(self.border + self.touches.values().sum::<u32>()).max(1.0)
+    }
+
     /// The mask as seen by the camera of a frame; `None` of a few pixels.
     pub(crate) fn observation(&self, camera: &PinholeCamera, time_index: usize) -> Option<Observation> {
         (self.pixels >= FEWEST_PIXELS).then(|| Observation {
@@ -127,6 +132,7 @@ mod tests {
         assert_eq!((block.pixels, block.low, block.high), (6, [0, 1], [2, 2]));
         assert_eq!((block.centroid(), block.is_cut(), block.border), (DVec2::new(1.5, 2.0), true, 2));
         assert_eq!(block.touches, BTreeMap::from([(UNLABELLED, 6), (7, 2)]));
+        assert_eq!(block.half_width_px(), 0.6);
         let bar = &table.rows[&7];
         assert_eq!((bar.pixels, bar.is_cut()), (2, false));
         assert_eq!(bar.touches, BTreeMap::from([(UNLABELLED, 4), (4, 2)]));

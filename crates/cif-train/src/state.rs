@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use cif_dataset::Dataset;
 use cif_field::Field;
+use cif_field::tracks::NO_GROUP;
 use cif_geometry::PixelGrid;
 use cif_render::{Blending, Gradients, InstanceSettings, RenderSettings, RenderedImage, UNLABELLED};
 
@@ -100,6 +101,16 @@ impl State {
             deform: self.field.deformation.is_some(),
             ..RenderSettings::default()
         }
+    }
+
+    /// Object that every Gaussian was made for, from 1 on; 0 for one that was made for none.
+    pub(crate) fn made_for(&self) -> Vec<u32> {
+        let guides = self.guidance.guides.len() as u32;
+        let group_of =
+            |row| self.field.tracks.as_ref()?.group_of.get(row).filter(|group| **group != NO_GROUP);
+        let guide_of = |row| self.guidance.guide_of.get(row).map_or(0, |guide| u32::from(*guide));
+        let made_for = |row| group_of(row).map_or_else(|| guide_of(row), |group| guides + 1 + group);
+        (0..self.field.len()).map(made_for).collect()
     }
 
     /// Motion that an object (a label: dense index + 1) is told to have.

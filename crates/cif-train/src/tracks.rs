@@ -6,6 +6,7 @@
 //! least-squares solution of all three with the directions in which the mask's centre is seen.
 
 use cif_geometry::PinholeCamera;
+use cif_geometry::stats::median;
 use glam::{DMat3, DVec2, DVec3};
 
 mod misfits;
@@ -222,6 +223,52 @@ pub fn fit(observations: &[Observation]) -> Option<Track> {
     }
     let radius = size.unwrap_or_default() / std::f64::consts::PI.sqrt();
     centres.iter().all(|centre| centre.is_finite()).then_some(Track { time_indices, centres, radius })
+}
+
+/// The path of an instance that does not travel (see [`travels`]): it rests where its masks agree best. `None` with too few
+/// observations, and where some camera does not see that point.
+pub(crate) fn resting(observations: &[Observation]) -> Option<Track> {
+    if observations.len() < FEWEST {
+        return None;
+    }
+    let point = fixed_point(observations);
+    let depth = |o: &Observation| o.camera.project(point).map(|(_, depth)| depth);
+    let depths: Vec<f64> = observations.iter().map(depth).collect::<Option<_>>()?;
+    let radius = radius(observations, &depths);
+    Some(Track { time_indices: vec![observations[0].time_index], centres: vec![point], radius })
+}
+
+/// The path along the rays through the masks of an instance, as deep as its contacts or, where a mask has none, as the
+/// median of those or as the `middle` of the scene. It jumps where depths do, but shows up inside every mask.
+///
+/// # Panics
+/// Without observations.
+pub(crate) fn on_rays(observations: &[Observation], middle: DVec3) -> Track {
+    let mut contacts: Vec<f64> = observations.iter().filter_map(|o| o.contact_depth).collect();
+    let usual = median(&mut contacts);
+    let depth_of = |o: &Observation| {
+        let known = o.contact_depth.or(usual);
+        known.unwrap_or_else(|| (middle - o.camera.centre()).length())
+    };
+    let depths: Vec<f64> = observations.iter().map(depth_of).collect();
+    let radius = radius(observations, &depths);
+    let (mut time_indices, mut centres) = (Vec::new(), Vec::new());
+    // Where several cameras see a time, the largest mask tells most.
+    let of_times = observations.iter().zip(depths);
+    for seen in of_times.collect::<Vec<_>>().chunk_by(|(a, _), (b, _)| a.time_index == b.time_index) {
+        if let Some((o, depth)) = seen.iter().max_by(|(a, _), (b, _)| a.area_px.total_cmp(&b.area_px)) {
+            time_indices.push(o.time_index);
+            centres.push(o.camera.centre() + o.camera.ray(o.centroid_px) * *depth);
+        }
+    }
+    Track { time_indices, centres, radius }
+}
+
+/// Radius of a disc as large as the masks at these depths, metres: the median.
+fn radius(observations: &[Observation], depths: &[f64]) -> f64 {
+    let focal_px = |o: &Observation| (o.camera.focal_px.x * o.camera.focal_px.y).sqrt();
+    let radii = observations.iter().zip(depths).map(|(o, depth)| depth * o.radius_px() / focal_px(o));
+    median(&mut radii.collect::<Vec<_>>()).unwrap_or_default()
 }
 
 impl Track {

@@ -80,9 +80,7 @@ fn captures_without_points_say_what_they_start_from() {
     let folder = capture::in_folder(8);
     let path = folder.path();
     fs::remove_file(path.join("table/points.npy")).unwrap();
-    let short = format!(
-        "{SMALL} --iterations-coarse 3 --iterations-fine 3 --iterations-instance 0 --set motion.rehearsal=1"
-    );
+    let short = format!("{SMALL} --iterations-coarse 3 --iterations-fine 3 --iterations-instance 0");
     let told = cif(path, &format!("train table -o a.cif {short}")).succeeds().stderr;
     // Which of the two depends on whether Python has pycolmap.
     let found = told.contains("were triangulated from its images");

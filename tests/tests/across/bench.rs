@@ -29,7 +29,7 @@ const PARTS: [&str; 14] = [
 ];
 
 /// Few steps of a small model.
-const SHORT: &str = "--steps 3 --warm-up 1 --set model.spatial_resolution=[8,8,8]";
+const SHORT: &str = "--steps 3 --warm-up 1 --set model.spatial_resolution=[8,8,8] --set motion.rigid=false";
 
 fn cif(folder: &Path, line: &str) -> Run {
     run(CIF, folder, line.split_whitespace())
@@ -94,7 +94,7 @@ fn the_instance_pass_is_compared_for_any_number_of_instances() {
     let folder = with_capture();
     let path = folder.path();
     let tiny = "--iterations-coarse 6 --iterations-fine 6 --iterations-instance 6 \
-                --set model.spatial_resolution=[8,8,8]";
+                --set model.spatial_resolution=[8,8,8] --set motion.rigid=false";
     cif(path, &format!("train table -o scene.cif --simd portable {tiny}")).succeeds();
     let facts = json(&cif(path, "info scene.cif --json").succeeds().stdout);
     assert!(facts["provenance"]["train"]["simd"].is_string(), "{facts:#}");
@@ -125,7 +125,7 @@ fn the_ladder_of_tolerances_tells_what_gltf_misses() {
     let folder = with_capture();
     let path = folder.path();
     let tiny = "--iterations-coarse 6 --iterations-fine 6 --iterations-instance 6 \
-                --set model.spatial_resolution=[8,8,8]";
+                --set model.spatial_resolution=[8,8,8] --set motion.rigid=false";
     // So few steps teach the network next to nothing: all would be taken to stand still.
     cif(path, &format!("train table -o scene.cif --effects all {tiny}")).succeeds();
     let line = "bench export scene.cif --tolerances 0.000001,50%";

@@ -19,7 +19,7 @@ fn with_scene() -> tempfile::TempDir {
     let folder = tempfile::tempdir().expect("a temporary folder");
     capture::write(&folder.path().join("table"), 5);
     let line = "train table -o table.cif -q --iterations-coarse 4 --iterations-fine 6 --iterations-instance 12 \
-                --stop-after 20 --debug-validation --set model.spatial_resolution=[8,8,8]";
+                --stop-after 20 --debug-validation --set model.spatial_resolution=[8,8,8] --set motion.rigid=false";
     cif(folder.path(), line).succeeds();
     folder
 }
@@ -159,7 +159,7 @@ fn points_at_absurd_distances_end_no_training() {
     }
     fs::write(&points, bytes).unwrap();
     let line = "train table -o far.cif -q --iterations-coarse 2 --iterations-fine 4 --iterations-instance 4 \
-                --set model.spatial_resolution=[8,8,8]";
+                --set model.spatial_resolution=[8,8,8] --set motion.rigid=false";
     cif(path, line).succeeds();
     let report = cif(path, "check far.cif --json").stdout;
     assert!(report.contains("far away"), "{report}");

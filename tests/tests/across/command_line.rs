@@ -539,7 +539,7 @@ fn work_goes_on_when_the_reader_of_its_messages_leaves() {
         command.status().expect("the command starts")
     };
     let tiny = "--iterations-coarse 2 --iterations-fine 2 --iterations-instance 2 \
-                --set model.spatial_resolution=[8,8,8]";
+                --set model.spatial_resolution=[8,8,8] --set motion.rigid=false";
     assert_eq!(unread(&format!("train table -o a.cif --log /dev/stderr {tiny}")).code(), Some(0));
     assert!(Field::load(path.join("a.cif")).is_ok());
     assert_eq!(unread("export a.cif --gltf a.glb --check").code(), Some(0));
@@ -595,7 +595,7 @@ fn captures_that_a_scene_does_not_know_are_told() {
     let folder = with_capture();
     let path = folder.path();
     let tiny = "--iterations-coarse 2 --iterations-fine 2 --iterations-instance 2 -q \
-                --set model.spatial_resolution=[8,8,8]";
+                --set model.spatial_resolution=[8,8,8] --set motion.rigid=false";
     cif(path, &format!("train table -o table.cif {tiny}")).succeeds();
     for line in ["eval table.cif table", "eval table.cif table --split train --downscale 2"] {
         let run = cif(path, line).succeeds();

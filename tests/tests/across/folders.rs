@@ -17,7 +17,7 @@ const CIF: &str = env!("CARGO_BIN_EXE_cif-under-test");
 
 /// Settings of a run that learns nothing.
 const TINY: &str = "--iterations-coarse 2 --iterations-fine 2 --iterations-instance 2 \
-                    --set model.spatial_resolution=[8,8,8]";
+                    --set model.spatial_resolution=[8,8,8] --set motion.rigid=false";
 
 /// Commands that write into the folder `shut`, where results are already: those that would work for long name inputs that
 /// are not there, so that their refusal comes before.

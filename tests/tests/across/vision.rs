@@ -474,7 +474,7 @@ fn scenes_of_a_comparison_are_asked_by_both_protocols() {
         { "text": "red", "answer": ["red ball"] }, { "text": "blue", "answer": [STANDING] },
     ] }] });
     fs::write(path.join("q.json"), questions.to_string()).unwrap();
-    let settings = "--set stages.coarse=100 --set stages.fine=200 --set model.spatial_resolution=[16,16,16] \
+    let settings = "--set stages.coarse=100 --set stages.fine=200 --set model.spatial_resolution=[16,16,16] --set motion.rigid=false \
                     --set densify.until=150 --set densify.max_gaussians=1500";
     let line = format!(
         "bench compare table -o out --heads cif --seeds 1 --iterations 60 --queries q.json --models models {settings}"

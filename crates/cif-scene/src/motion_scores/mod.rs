@@ -10,8 +10,10 @@
 //! |---|---|
 //! | `carry` | where splats take a point |
 //! | `opacity_box` | the box of the splats, and its overlap with the true one |
+//! | `claims` | whether rotations are as nodes claim them |
 
 mod carry;
+mod claims;
 mod opacity_box;
 
 use std::collections::BTreeMap;
@@ -24,7 +26,9 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use self::carry::{Anchored, Placed};
+pub use self::claims::{Claims, Verdicts};
 use crate::{MotionModel, Node, NodeKind, SceneGraph};
+use cif_field::RotationEvidence;
 use cif_geometry::align::procrustes::{polar_rotation, weighted_procrustes};
 
 /// First times of an instance at most.
@@ -39,7 +43,10 @@ const LEAST_PATH: f64 = 1e-4;
 pub struct MotionErrors {
     /// Mean distance between carried and true points, millimetres.
     pub error_mm: Option<f64>,
-    /// The same had nothing moved, millimetres: what there was to explain.
+    /// The same as a share of the size of the object, percent: of the diagonal of its true box at the last time at which
+    /// it was seen.
+    pub error_of_size: Option<f64>,
+    /// `error_mm` had nothing moved, millimetres: what there was to explain.
     pub rest_mm: Option<f64>,
     /// Share of carried points nearer than 10 mm to the true ones, percent.
     pub within_10_mm: Option<f64>,
@@ -68,6 +75,8 @@ pub struct InstanceMotion {
     pub moves: bool,
     /// Motion model of its node; `None` where it has none.
     pub model: Option<MotionModel>,
+    /// Evidence that its node claims for its rotations; `None` where it claims none.
+    pub claim: Option<RotationEvidence>,
     /// Splats of its node.
     pub splats: usize,
     /// Times at which it was seen.
@@ -96,6 +105,8 @@ pub struct MotionScores {
     pub moving: Option<MeanMotion>,
     /// Means over the instances that stand still.
     pub resting: Option<MeanMotion>,
+    /// Rotations of the rigid instances that turn, by what their nodes claim of them.
+    pub claims: Claims,
     /// Every instance, ascending id.
     pub instances: Vec<InstanceMotion>,
 }
@@ -134,7 +145,12 @@ pub fn motion_scores(
             instance(graph, node, *id, motion, &times)
         })
         .collect();
-    MotionScores { moving: mean(&instances, true), resting: mean(&instances, false), instances }
+    MotionScores {
+        moving: mean(&instances, true),
+        resting: mean(&instances, false),
+        claims: Claims::of(&instances),
+        instances,
+    }
 }
 
 /// A time on both sides.
@@ -166,6 +182,7 @@ fn instance(
         truth: motion.kind.clone(),
         moves,
         model: node.map(Node::model),
+        claim: node.and_then(|node| node.report.rotation),
         splats: node.map_or(0, |node| node.splats.len()),
         times: times.len(),
         turned_deg: turns.reduce(f64::max),
@@ -217,8 +234,10 @@ fn errors(
     }
     let share = |value: f64| Some(value / count as f64);
     let percent = |within: usize| share(100.0 * within as f64);
+    let last = &motion.boxes[times[times.len() - 1].step];
     MotionErrors {
         error_mm: share(error),
+        error_of_size: share(100.0 * error / (1e3 * last.size().length())),
         rest_mm: share(rest),
         within_10_mm: percent(within[0]),
         within_20_mm: percent(within[1]),
@@ -262,6 +281,7 @@ fn mean(instances: &[InstanceMotion], moves: bool) -> Option<MeanMotion> {
         instances: of(|errors| errors.error_mm)?.0,
         errors: MotionErrors {
             error_mm: mean(|errors| errors.error_mm),
+            error_of_size: mean(|errors| errors.error_of_size),
             rest_mm: mean(|errors| errors.rest_mm),
             within_10_mm: mean(|errors| errors.within_10_mm),
             within_20_mm: mean(|errors| errors.within_20_mm),

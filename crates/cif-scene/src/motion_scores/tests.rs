@@ -119,6 +119,8 @@ fn a_still_graph_leaves_the_whole_path_unexplained() {
     let found = scores(&graph, &truth("rigid", &shifts(3, DVec3::X * 0.015))).instances[0].errors;
     near(found.error_mm, 20.0, 1e-9);
     near(found.rest_mm, 20.0, 1e-9);
+    // Of a cube of side 200 mm.
+    near(found.error_of_size, 100.0 * 20.0 / (200.0 * 3.0_f64.sqrt()), 1e-9);
     assert_eq!(found.within_10_mm, Some(0.0));
     near(found.within_20_mm, 400.0 / 6.0, 1e-9);
     assert_eq!(found.within_50_mm, Some(100.0));
@@ -143,6 +145,32 @@ fn rotations_that_are_missed_are_told_in_degrees() {
     let found = scores(&graph, &truth("deforming", &[turn(0.0), turn(FRAC_PI_2)])).instances.remove(0);
     assert_eq!((found.errors.rotation_deg, found.turned_deg), (None, None));
     near(found.errors.error_mm, 100.0 * 2.0_f64.sqrt() * 4.0 / 6.0, 1e-6);
+}
+
+#[test]
+fn rotations_count_by_what_is_claimed_of_them() {
+    let turned = |degrees: f64| RigidTransform {
+        rotation: DMat3::from_rotation_z(degrees.to_radians()),
+        ..RigidTransform::IDENTITY
+    };
+    let claims = |found: f64, truth_deg: f64, kind: &str, claim| {
+        let motion = Motion::Rigid(track(&[RigidTransform::IDENTITY, turned(found)]));
+        let mut graph = graph(&corners(), 1e-9, motion, 2);
+        graph.nodes[0].report.rotation = claim;
+        scores(&graph, &truth(kind, &[RigidTransform::IDENTITY, turned(truth_deg)])).claims
+    };
+    let (observed, assumed) = (Some(RotationEvidence::Observed), Some(RotationEvidence::Assumed));
+    let (right, wrong) = (Verdicts { right: 1, wrong: 0 }, Verdicts { right: 0, wrong: 1 });
+    let none = Claims::default();
+    assert_eq!(claims(76.0, 90.0, "rigid", observed), Claims { observed: right, ..none });
+    assert_eq!(claims(74.0, 90.0, "rigid", observed), Claims { observed: wrong, ..none });
+    assert_eq!(claims(90.0, 90.0, "rigid", assumed), Claims { assumed: right, ..none });
+    assert_eq!(claims(0.0, 90.0, "rigid", assumed), Claims { assumed: wrong, ..none });
+    assert_eq!(claims(90.0, 90.0, "rigid", None), Claims { none: right, ..none });
+    assert_eq!(claims(0.0, 90.0, "rigid", None), Claims { none: wrong, ..none });
+    // What hardly turns is right without turning, and what deforms has no rotation.
+    assert_eq!(claims(0.0, 19.0, "rigid", observed), none);
+    assert_eq!(claims(0.0, 90.0, "deforming", observed), none);
 }
 
 #[test]

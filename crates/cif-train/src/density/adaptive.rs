@@ -1,5 +1,7 @@
 //! Adaptive density control: cloning, splitting, pruning and opacity resets. Source: methods reference 1.5.
 
+use std::collections::{BTreeMap, BTreeSet};
+
 use cif_field::Gaussians;
 use cif_geometry::scalar::{logit, sigmoid};
 use rand::Rng;
@@ -28,13 +30,10 @@ impl Strategy for Adaptive {
     }
 
     fn change(&self, k: usize, step: &Moment<'_>, rows: &Rows<'_>, rng: &mut Pcg64) -> Change {
-        let Rows { gaussians, statistics, extent, opacities_were_reset } = *rows;
+        let Rows { gaussians, statistics, extent, .. } = *rows;
         let config = &step.config.densify;
         match CHANGES.into_iter().filter(|due| step.has(*due)).nth(k) {
-            Some(Due::Prune) => Change {
-                rearrangement: prune(gaussians, statistics, config, extent, opacities_were_reset),
-                ..Change::default()
-            },
+            Some(Due::Prune) => Change { rearrangement: prune(rows, config), ..Change::default() },
             Some(Due::Add) => Change {
                 rearrangement: add_gaussians(gaussians, statistics, config, extent, rng),
                 restarts_statistics: true,
@@ -81,16 +80,15 @@ pub fn add_gaussians(
     Some(with_copies(gaussians, &clones, &splits, rng))
 }
 
-/// Removes transparent Gaussians and, once opacities were reset, those too large on screen or in space.
-/// `None` when nothing changes.
+/// Gaussians of an object that no rule removes, the most opaque: as few as have a box and a rotation, four points in no
+/// plane.
+pub(crate) const FEWEST_OF_OBJECT: usize = 4;
+
+/// Removes transparent Gaussians and, once opacities were reset, those too large on screen or in space, but not the
+/// last ones of an object. `None` when none goes.
 #[must_use]
-pub fn prune(
-    gaussians: &Gaussians,
-    statistics: &DensifyStatistics,
-    config: &DensifyConfig,
-    extent: f32,
-    opacities_were_reset: bool,
-) -> Option<Rearrangement> {
+pub fn prune(rows: &Rows<'_>, config: &DensifyConfig) -> Option<Rearrangement> {
+    let Rows { gaussians, statistics, extent, opacities_were_reset, .. } = *rows;
     let n = gaussians.len();
     if n <= config.prune_min_n as usize {
         return None;
@@ -101,7 +99,35 @@ pub fn prune(
                 && (statistics.radius[row] > config.prune_radius_px
                     || largest_scale(gaussians, row) > config.prune_scale * extent))
     };
-    keep(gaussians, (0..n as u32).filter(|row| !goes(*row as usize)).collect())
+    let last = last_of_objects(rows, &goes);
+    let kept: Vec<u32> = (0..n as u32).filter(|row| !goes(*row as usize) || last.contains(row)).collect();
+    let mut change = keep(gaussians, kept)?;
+    // Drawn as faintly as anything may be.
+    let least = logit(config.prune_opacity);
+    for (row, logit) in change.parents.iter().zip(&mut change.gaussians.opacity_logits) {
+        if last.contains(row) {
+            *logit = logit.max(least);
+        }
+    }
+    Some(change)
+}
+
+/// Rows to keep of those that go, so that every object has a few.
+fn last_of_objects(rows: &Rows<'_>, goes: &impl Fn(usize) -> bool) -> BTreeSet<u32> {
+    let mut of_objects: BTreeMap<u32, Vec<usize>> = BTreeMap::new();
+    for (row, object) in rows.made_for.iter().enumerate().filter(|(_, object)| **object > 0) {
+        of_objects.entry(*object).or_default().push(row);
+    }
+    let mut last = BTreeSet::new();
+    for (_, of_object) in of_objects {
+        let (mut going, staying): (Vec<usize>, Vec<usize>) =
+            of_object.into_iter().partition(|row| goes(*row));
+        let opacity = |row: &usize| rows.gaussians.opacity_logits[*row];
+        going.sort_by(|a, b| opacity(b).total_cmp(&opacity(a)));
+        let wanted = FEWEST_OF_OBJECT.saturating_sub(staying.len());
+        last.extend(going.into_iter().take(wanted).map(|row| row as u32));
+    }
+    last
 }
 
 /// Caps every opacity; the caller zeroes the opacity moments (methods reference 7, row 24).

@@ -14,6 +14,7 @@ pub mod relocate;
 mod statistics;
 mod strategy;
 
+pub(crate) use adaptive::FEWEST_OF_OBJECT;
 pub use rearrangement::{Rearrangement, keep, with_copies};
 pub use statistics::DensifyStatistics;
 pub use strategy::{Change, Rows, Strategy};

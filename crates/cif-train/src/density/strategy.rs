@@ -14,6 +14,8 @@ pub struct Rows<'a> {
     pub gaussians: &'a Gaussians,
     /// What steps counted of every row since the set last grew.
     pub statistics: &'a DensifyStatistics,
+    /// Object that every row was made for, from 1 on; 0 for one that was made for none.
+    pub made_for: &'a [u32],
     /// Extent of the scene, metres.
     pub extent: f32,
     /// True when opacities were capped in this stage.

@@ -78,12 +78,44 @@ fn pruning_needs_enough_gaussians_and_large_ones_go_only_after_a_reset() {
     let (gaussians, mut statistics) = scene();
     statistics.radius[2] = 30.0;
     let parity = DensifyConfig { prune_min_n: 4, ..DensifyConfig::default() };
-    assert!(prune(&gaussians, &statistics, &parity, EXTENT, true).is_none());
+    let rows = |opacities_were_reset: bool| Rows {
+        gaussians: &gaussians,
+        statistics: &statistics,
+        made_for: &[0; 4],
+        extent: EXTENT,
+        opacities_were_reset,
+    };
+    assert!(prune(&rows(true), &parity).is_none());
     let config = DensifyConfig::default();
-    let before = prune(&gaussians, &statistics, &config, EXTENT, false).unwrap();
+    let before = prune(&rows(false), &config).unwrap();
     assert_eq!((before.pruned, before.origins), (1, vec![Some(0), Some(1), Some(2)]));
-    let after = prune(&gaussians, &statistics, &config, EXTENT, true).unwrap();
+    let after = prune(&rows(true), &config).unwrap();
     assert_eq!((after.pruned, after.origins), (3, vec![Some(0)]));
+}
+
+#[test]
+fn the_last_of_an_object_stay_and_are_drawn() {
+    let opacities = [0.9, 0.003, 0.001, 0.004, 0.002, 0.001, 0.001];
+    let gaussians = Gaussians { opacity_logits: opacities.map(logit).to_vec(), ..scene().0.gather(&[0; 7]) };
+    let statistics = DensifyStatistics::zeros(7);
+    let kept = |made_for: &[u32]| {
+        let rows = Rows {
+            gaussians: &gaussians,
+            statistics: &statistics,
+            made_for,
+            extent: EXTENT,
+            opacities_were_reset: false,
+        };
+        prune(&rows, &DensifyConfig { prune_min_n: 0, ..DensifyConfig::default() }).unwrap()
+    };
+    assert_eq!(kept(&[0; 7]).parents, [0]);
+    // Of one object one stays anyway; the three most opaque of the others stay with it. Another has one in all.
+    let change = kept(&[1, 1, 1, 1, 1, 1, 2]);
+    assert_eq!(change.parents, [0, 1, 3, 4, 6]);
+    let least = DensifyConfig::default().prune_opacity;
+    for (kept, before) in change.gaussians.opacity_logits.iter().zip([0.9, least, least, least, least]) {
+        assert!((sigmoid(*kept) - before).abs() < 1e-6, "{}", sigmoid(*kept));
+    }
 }
 
 #[test]

@@ -1,9 +1,8 @@
 //! Paths of travelling objects: found in the masks, taught to the deformation, and held while it trains.
 
+use cif_field::Field;
 use cif_field::parameters::{MLP, PLANES};
-use cif_field::{Field, Gaussians};
 use cif_geometry::PixelGrid;
-use cif_geometry::scalar::logit;
 use cif_render::cpu::Renderer;
 use cif_render::{Channels, Gradients, RenderSettings, RenderedImage, UNLABELLED};
 use glam::DVec3;
@@ -15,20 +14,15 @@ use super::plan_step::plane_weights;
 use crate::effects::appearing::hide_absent;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
-use crate::guidance::Guide;
 use crate::optimiser::{Optimiser, StepRates};
 use crate::phase::Phase;
 use crate::random::{Purpose, stream};
 use crate::stage::Stage;
 use crate::state::State;
-use crate::tracks::{Observation, Track, fit, travels};
+use crate::tracks::{Observation, fit, on_rays, resting, travels};
 
 /// Share of the nearest depths around a mask that is taken for noise.
 const CONTACT_SHARE: f64 = 0.08;
-/// Opacity that injected Gaussians start with.
-const OPACITY: f32 = 0.4;
-/// Share of the frames in which a point of an object may fall beside its mask.
-const OUTSIDE: f64 = 0.15;
 
 impl Trainer {
     /// Finds out which instances travel: the work of the search stage.
@@ -110,16 +104,25 @@ impl Trainer {
             return Ok(());
         }
         self.state.guidance.guide_of = vec![0; self.state.field.gaussians.len()];
-        if self.state.guidance.travelling.contains(&true) {
+        let travels = |label: &u16| self.state.guidance.travelling.get(usize::from(*label)) == Some(&true);
+        let travelling: Vec<u16> = (1..=self.state.field.instances.len() as u16).filter(travels).collect();
+        let lacking = self.without_gaussians(&travelling)?;
+        if !travelling.is_empty() || !lacking.is_empty() {
             let observations = self.observe(true)?;
             self.fit_travelling()?;
             let mut posed = Vec::new();
-            for (of, observations) in observations.iter().enumerate() {
-                if self.state.guidance.travelling[of + 1]
-                    && !self.add_object(of as u16 + 1, &mut posed)
-                    && let Some(track) = fit(observations)
-                {
-                    self.inject(of as u16 + 1, track, observations)?;
+            for (k, seen) in observations.iter().enumerate() {
+                let label = k as u16 + 1;
+                let track = if lacking.contains(&label) {
+                    resting(seen)
+                } else if travelling.contains(&label) && !self.add_object(label, &mut posed) {
+                    fit(seen)
+                } else {
+                    continue;
+                };
+                if !seen.is_empty() {
+                    let middle = self.state.dataset.points.core_bounds().centre();
+                    self.seed(label, track.unwrap_or_else(|| on_rays(seen, middle)), seen)?;
                 }
             }
             let notes = hide_absent(&mut self.state, self.simd, &posed)?;
@@ -131,70 +134,6 @@ impl Trainer {
             tracks.group_of.resize(n, cif_field::tracks::NO_GROUP);
         }
         self.rehearse()
-    }
-
-    /// Gaussians for one travelling object, inside its masks wherever it goes.
-    fn inject(&mut self, label: u16, track: Track, seen: &[Observation]) -> Result<(), TrainError> {
-        let times = &self.state.dataset.times;
-        // The canonical pose is the one that shows most of it.
-        let Some(best) = seen.iter().max_by(|a, b| {
-            (!a.cut, a.area_px).partial_cmp(&(!b.cut, b.area_px)).unwrap_or(std::cmp::Ordering::Equal)
-        }) else {
-            return Ok(());
-        };
-        let reference = track.at(times, times[best.time_index]);
-        let mut rng = stream(self.state.config.seed, Purpose::Guidance, u64::from(label));
-        let wanted = self.state.config.motion.gaussians as usize;
-        let frames: Vec<_> = (0..self.state.frames.len())
-            .map(|view| {
-                self.state.phases.check()?;
-                Ok((self.state.frames.index(view), self.state.frames.get(&self.state.dataset, view)?))
-            })
-            .collect::<Result<_, TrainError>>()?;
-        let (mut positions, mut colors) = (Vec::new(), Vec::new());
-        for _ in 0..wanted * 40 {
-            if positions.len() == wanted {
-                break;
-            }
-            self.state.phases.check()?;
-            let offset = DVec3::from(std::array::from_fn(|_| rng.random::<f64>() * 2.0 - 1.0));
-            let offset = offset * 1.5 * track.radius;
-            let (mut inside, mut outside, mut sum) = (0.0_f64, 0.0_f64, DVec3::ZERO);
-            for (index, data) in &frames {
-                let frame = &self.state.dataset.frames[*index];
-                let Some(labels) = &data.labels else { continue };
-                if !seen.iter().any(|o| o.time_index == frame.time_index) {
-                    continue;
-                }
-                let place = track.at(times, frame.time) + offset;
-                let Some([x, y]) = frame.camera.pixel_of(place) else { continue };
-                let found = *labels.at(x, y);
-                if found == label {
-                    inside += 1.0;
-                    let color = data.image.at(x, y);
-                    sum += DVec3::from(color.map(|c| f64::from(c) / 255.0));
-                } else if found == UNLABELLED {
-                    outside += 1.0;
-                }
-            }
-            if inside > 0.0 && outside <= OUTSIDE * (inside + outside) {
-                positions.push((reference + offset).as_vec3().to_array());
-                colors.push((sum / inside).as_vec3().to_array());
-            }
-        }
-        if positions.len() < 4 {
-            return Ok(());
-        }
-        let mut fresh = Gaussians::from_points(&positions, &colors)?;
-        fresh.opacity_logits.fill(logit(OPACITY));
-        fresh.occupancy_logits.fill(logit(self.state.config.instance.occupancy));
-        // Objects with poses came in between, which no path holds.
-        let State { field, guidance, .. } = &mut self.state;
-        guidance.guide_of.resize(field.len(), 0);
-        field.gaussians.append(&fresh);
-        guidance.guides.push(Guide { track, reference });
-        guidance.guide_of.resize(field.len(), guidance.guides.len() as u16);
-        Ok(())
     }
 
     /// Teaches the deformation the paths before it sees an image.

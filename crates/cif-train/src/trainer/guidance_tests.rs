@@ -2,9 +2,11 @@
 
 use std::collections::BTreeMap;
 use std::f64::consts::PI;
+use std::path::Path;
 
+use cif_dataset::Dataset;
 use cif_field::{Gaussians, RotationEvidence};
-use glam::{DQuat, DVec3};
+use glam::{DQuat, DVec2, DVec3};
 
 use super::Trainer;
 use super::guard_tests::support::{Scene, capture, small_config, stopped_after};
@@ -88,6 +90,88 @@ fn paths_hold_no_object_that_has_poses() {
     let posed = (0..trainer.state.field.len()).filter(|row| tracks.group(*row).is_some());
     assert!(posed.map(|row| guidance.guide_of[row]).eq([0; 3]));
     assert_eq!(trainer.state.pose_moments.shares, [1.0, 0.1]);
+}
+
+/// A capture of one camera that jumps, in which a rod as thin as two pixels that turns and travels is in the place of the
+/// third ball.
+fn with_rod(folder: &Path) -> Dataset {
+    let scene = Scene { times: 8, views: 8, rolls: Some(1.0), one_camera: true, ..Scene::default() };
+    let mut dataset = capture(folder, scene);
+    // Nothing was measured of it.
+    dataset.points.positions.drain(300..450);
+    dataset.points.colors.drain(300..450);
+    for frame in &dataset.frames {
+        let mut ids = image::open(frame.mask.as_ref().unwrap()).unwrap().into_luma8();
+        let mut colors = image::open(&frame.image).unwrap().into_rgb8();
+        let (sin, cos) = (0.4 + 2.0 * frame.time).sin_cos();
+        let middle = frame.camera.project(DVec3::new((PI * frame.time).sin() - 0.5, 0.25, -0.75)).unwrap().0;
+        for (x, y, id) in ids.enumerate_pixels_mut() {
+            let from = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5) - middle;
+            let (along, across) = (cos * from.x + sin * from.y, cos * from.y - sin * from.x);
+            if along.abs() < 7.0 && across.abs() < 1.0 {
+                id.0 = [9];
+                colors.put_pixel(x, y, image::Rgb([40, 60, 210]));
+            } else if id.0 == [9] {
+                id.0 = [0];
+            }
+        }
+        ids.save(frame.mask.as_ref().unwrap()).unwrap();
+        colors.save(&frame.image).unwrap();
+    }
+    dataset
+}
+
+/// Gaussians that show up inside the mask of the third instance in the view that shows most of it, in which they lie.
+fn inside_its_mask(trainer: &Trainer) -> usize {
+    let state = &trainer.state;
+    let shown = |view: &usize| {
+        let labels = state.frames.get(&state.dataset, *view).unwrap();
+        labels.labels.as_ref().unwrap().pixels.iter().filter(|label| **label == 3).count()
+    };
+    let inside = |view: usize| {
+        let data = state.frames.get(&state.dataset, view).unwrap();
+        let camera = &state.dataset.frames[state.frames.index(view)].camera;
+        let is_inside = |row: &usize| {
+            let place = DVec3::from(state.field.gaussians.means[*row].map(f64::from));
+            camera.pixel_of(place).is_some_and(|[x, y]| *data.labels.as_ref().unwrap().at(x, y) == 3)
+        };
+        let owned = state.made_for();
+        (0..state.field.len()).filter(|row| owned[*row] > 0).filter(is_inside).count()
+    };
+    inside((0..state.frames.len()).max_by_key(shown).unwrap())
+}
+
+#[test]
+fn a_thin_rod_that_travels_begins_inside_its_mask() {
+    for travels in [true, false] {
+        let folder = tempfile::tempdir().unwrap();
+        let mut config = small_config();
+        (config.motion.guidance, config.motion.rehearsal, config.motion.rigid) = (10.0, 1, false);
+        let mut trainer = Trainer::new(with_rod(folder.path()), config).unwrap();
+        trainer.state.guidance.travelling = vec![false, false, false, travels];
+        trainer.enter(Stage::Fine).unwrap();
+        let inside = inside_its_mask(&trainer);
+        assert!(inside >= 10, "{inside} where it travels: {travels}");
+        trainer.state.field.validate().unwrap();
+    }
+}
+
+#[test]
+fn objects_with_gaussians_get_no_others() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene::default());
+    let mut config = small_config();
+    (config.motion.guidance, config.motion.rehearsal, config.motion.rigid) = (10.0, 1, false);
+    let mut trainer = Trainer::new(dataset, config).unwrap();
+    assert!(trainer.without_gaussians(&[]).unwrap().is_empty());
+    let balls = trainer.state.field.len();
+    trainer.state.guidance.travelling = vec![false; 4];
+    trainer.enter(Stage::Fine).unwrap();
+    assert_eq!(trainer.state.field.len(), balls);
+    // Too faint to be drawn.
+    trainer.state.field.gaussians.opacity_logits[150..300].fill(-8.0);
+    assert_eq!(trainer.without_gaussians(&[]).unwrap(), [2]);
+    assert!(trainer.without_gaussians(&[2]).unwrap().is_empty());
 }
 
 /// Changes of visibility that the third ball, which has poses where masks show it, is given.

@@ -9,9 +9,11 @@
 //! | `step` | how a step is done, and what falls behind it |
 //! | `heads` | what heads of other systems see and change between steps |
 //! | `guidance` | how travelling objects start on the paths that masks tell |
+//! | `seeds` | what objects begin with that nothing was made of |
 //! | `objects`, `parts` | which objects move as a whole or in a part, and how they join the field |
 //! | `identity` | how identity rows come about |
 //! | `shares` | how much of a Gaussian is of any instance |
+//! | `contradicted` | which Gaussians masks show to be of no instance |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
 //! | `resume` | what is saved, and how a run resumes |
 //! | `evaluate` | what a run has reached, on a few frames |
@@ -26,6 +28,7 @@
 //! threads.
 
 mod backend;
+mod contradicted;
 mod eta;
 mod evaluate;
 mod from_scene;
@@ -55,6 +58,7 @@ mod provenance;
 mod resume;
 mod run;
 mod saving;
+mod seeds;
 #[cfg(feature = "wgpu")]
 mod shape;
 mod shares;

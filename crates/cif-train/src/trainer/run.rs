@@ -225,6 +225,7 @@ impl Trainer {
         if stage == Stage::Instance {
             // The last that may be stopped in this stage: it must not be done twice.
             self.sharpen_shares()?;
+            self.disown_contradicted()?;
         }
         let wall_s = self.progress().stages_s.get(stage.name()).copied().unwrap_or(0.0);
         let gaussians = self.state.field.gaussians.len();

@@ -266,6 +266,7 @@ impl Trainer {
             let rows = Rows {
                 gaussians: &state.field.gaussians,
                 statistics: &state.statistics,
+                made_for: &state.made_for(),
                 extent: state.field.extent,
                 opacities_were_reset: state.progress.opacities_were_reset,
             };

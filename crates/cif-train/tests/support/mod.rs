@@ -275,7 +275,8 @@ pub(crate) fn small_config() -> TrainConfig {
     config.resample.every = 20;
     config.resample.until = 100;
     config.resample.rate = 0.05;
-    config.motion.parts = false;
+    // Fits of objects take longer than such a run: tests that are about them turn them on.
+    (config.motion.rigid, config.motion.parts, config.motion.rehearsal) = (false, false, 30);
     // Its window is as large as a ball of these images.
     config.loss.lambda_dssim = 0.0;
     config.loss.time_smoothness = 1e-3;

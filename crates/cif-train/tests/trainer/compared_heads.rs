@@ -268,7 +268,7 @@ fn heads_learn_the_same_on_a_gpu() {
         let started = || {
             let (_, dataset, reconstruction) = &*RECONSTRUCTION;
             let mut config = TrainConfig { head: named(name), ..config() };
-            (config.stages.instance, config.report.step_every) = (12, 1);
+            (config.stages.instance, config.report.step_every) = (8, 1);
             Trainer::from_scene(dataset.clone(), config, reconstruction.clone(), "base.cif").unwrap()
         };
         let (on_processor, field) = losses(started());

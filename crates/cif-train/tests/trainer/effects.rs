@@ -103,11 +103,7 @@ fn what_stands_still_skips_the_network_and_what_moves_does_not() {
     let folder = tempfile::tempdir().unwrap();
     let dataset = capture(folder.path(), Scene::default());
     let mut settled = Vec::new();
-    // Objects with poses of their own skip it in any case.
-    let [some, every] = [still_config(), small_config()].map(|mut config| {
-        config.motion.rigid = false;
-        config
-    });
+    let [some, every] = [still_config(), small_config()];
     let mut trainer = Trainer::new(dataset.clone(), some.clone()).unwrap();
     let outcome = trainer.run(&mut |event, _| {
         if let TrainEvent::Settled { still, .. } = event {
@@ -138,9 +134,11 @@ fn what_stands_still_skips_the_network_and_what_moves_does_not() {
 fn cameras_that_stay_in_place_tell_from_the_first_step_what_stands_still() {
     let folder = tempfile::tempdir().unwrap();
     let dataset = capture(folder.path(), Scene::default());
+    let mut config = still_config();
+    config.stages.coarse = 40;
     // The first test of the fine stage: on which step, and the share of Gaussians that it settles.
     let first_test = |dataset: &Dataset| {
-        let mut trainer = Trainer::new(dataset.clone(), still_config()).unwrap();
+        let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
         let mut first = None;
         let outcome = trainer.run(&mut |event, _| {
             if let TrainEvent::Settled { stage: Stage::Fine, iteration, still, gaussians, .. } = event {
@@ -190,7 +188,7 @@ fn a_resumed_run_keeps_what_stands_still_and_what_was_judged() {
     let deformation = whole.field().deformation.as_ref().unwrap();
     assert!(deformation.still.contains(&true) && !deformation.config.heads.rotation);
     assert_eq!(whole.field().sh_degree, 0);
-    for stop_at in [72_u64, 73, 95, 131, 175] {
+    for stop_at in [72_u64, 73, 131] {
         let trainer = stopped_after(&dataset, &config, stop_at);
         let path = folder.path().join("stopped.cif");
         trainer.checkpoint(true).save(&path).unwrap();
@@ -200,7 +198,7 @@ fn a_resumed_run_keeps_what_stands_still_and_what_was_judged() {
         assert_eq!(without_record(resumed.field()), without_record(whole.field()), "stopped after {stop_at}");
         stopped += 1;
     }
-    assert_eq!(stopped, 5);
+    assert_eq!(stopped, 3);
 }
 
 #[test]

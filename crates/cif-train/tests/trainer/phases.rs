@@ -44,7 +44,7 @@ fn guided() -> TrainConfig {
     let mut config = small_config();
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (20, 30, 10);
     (config.motion.guidance, config.motion.stillness, config.motion.rehearsal) = (10.0, 1.0, 20);
-    config.motion.gaussians = 60;
+    (config.motion.rigid, config.motion.gaussians) = (true, 60);
     config.report.evaluate_every = 25;
     config
 }

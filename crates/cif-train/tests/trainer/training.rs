@@ -23,7 +23,7 @@ fn a_run_reaches_its_quality_and_reports_its_stages() {
     let folder = tempfile::tempdir().unwrap();
     let dataset = capture(folder.path(), Scene { times: 4, views: 6, ..Scene::default() });
     let mut config = small_config();
-    config.stages.fine = 500;
+    (config.stages.fine, config.motion.rigid) = (500, true);
     config.report.evaluate_every = 200;
     let mut trainer = Trainer::new(dataset.clone(), config).unwrap();
     let (mut stages, mut names) = (Vec::new(), BTreeSet::new());
@@ -71,13 +71,13 @@ fn a_resumed_run_ends_where_the_uninterrupted_one_ends() {
     let folder = tempfile::tempdir().unwrap();
     let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
     let mut config = small_config();
-    (config.stages.coarse, config.stages.fine, config.stages.instance) = (50, 90, 50);
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (30, 60, 30);
     (config.densify.from, config.densify.every, config.stages.batch) = (10, 20, 2);
     config.densify.opacity_reset_every = 35;
     let whole = train(dataset.clone(), config.clone());
     let total = Trainer::new(dataset.clone(), config.clone()).unwrap().steps_left();
     // Interruptions inside every stage, and on both sides of a densification.
-    for stop_at in [7_u64, 59, 61, 139, 165] {
+    for stop_at in [7_u64, 49, 51, 105] {
         let trainer = stopped_after(&dataset, &config, stop_at);
         assert_eq!(trainer.steps_left(), total - stop_at);
         let path = folder.path().join("stopped.cif");
@@ -95,7 +95,7 @@ fn eventful_config() -> TrainConfig {
     let mut config = small_config();
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (20, 40, 30);
     (config.motion.guidance, config.motion.stillness, config.motion.rehearsal) = (10.0, 1.0, 30);
-    config.motion.gaussians = 40;
+    (config.motion.rigid, config.motion.gaussians) = (true, 40);
     (config.densify.from, config.densify.every, config.densify.max_gaussians) = (5, 10, 1_200);
     (config.effects.still_every, config.effects.still_from, config.effects.still_told) = (10, 0.2, 10);
     (config.effects.sh_gain, config.effects.head_gain, config.model.sh_interval) = (0.01, 0.01, 7);
@@ -203,7 +203,7 @@ fn saving_by_time_changes_nothing_and_every_state_goes_on() {
         assert!(states.iter().any(|(at, done, _)| (*at, *done) == (stage, 0)), "one as {stage} begins");
     }
     assert!(states.iter().any(|(_, done, _)| *done > 0), "and others by time");
-    for (_, _, state) in states.into_iter().step_by(3) {
+    for (_, _, state) in states.into_iter().step_by(5) {
         let mut resumed = Trainer::resume(dataset.clone(), state).unwrap();
         assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
         assert_equal(resumed.field(), &never);

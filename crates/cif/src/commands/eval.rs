@@ -40,10 +40,12 @@ n/a (JSON null) means that there is nothing to measure.
 Motion is measured where the capture has motion.json and tracks.npz, on what `cif export` would
 write by default, over all times. Followed surface points of an instance are carried from eight
 times to all others by the four nearest splats; times at which no mask shows 20 pixels of it do
-not count. The table has the mean distance from the true points, the same had nothing moved, the
-share of points within 10, 20 and 50 mm, the median error of rotation (rigid instances that move),
-the largest rotation there was, and the overlap (IoU) of the box of the splats with the true one,
-percent; JSON: motion.
+not count. The table has the mean distance from the true points, the same as a share of the diagonal
+of the object's true box, the same had nothing moved, the share of points within 10, 20 and 50 mm,
+the median error of rotation (rigid instances that move), the largest rotation there was, what the
+scene claims of it (observed, assumed or none), and the overlap (IoU) of the box of the splats with
+the true one, percent. A second table counts the rigid objects that turn by more than 20 degrees by
+that claim: their rotation is right where its median error is at most 15 degrees. JSON: motion.
 
   cif eval table.cif captures/table
   cif eval table.cif captures/table --masks masks --json scores.json --images pictures
