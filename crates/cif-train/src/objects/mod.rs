@@ -40,7 +40,7 @@ mod shape;
 mod sphere;
 mod start;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 #[cfg(test)]
 mod tests;
 mod texture;
@@ -56,10 +56,11 @@ pub(crate) use self::known::KnownObjects;
 pub(crate) use self::order::Order;
 pub(crate) use self::parts::Jointed;
 pub(crate) use self::plane::Plane;
+pub(crate) use self::shape::Pose;
 use self::start::Object;
 pub(crate) use self::start::{Fitted, Surroundings};
 pub(crate) use self::trials::BENDS_NO_BETTER;
-use self::view::ObjectView;
+pub(crate) use self::view::{ObjectView, Seen};
 use crate::error::TrainError;
 use crate::frames::FrameStore;
 use crate::phases::Phases;

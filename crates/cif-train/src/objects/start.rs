@@ -24,6 +24,7 @@ use super::trials::{self, GAUSSIANS, STEPS};
 use super::view::{ObjectView, is_one_camera, median};
 use super::ways::{Way, rolled};
 use crate::error::TrainError;
+use crate::motion::Judge;
 use crate::phases::Phases;
 use crate::random::{Purpose, stream};
 
@@ -54,6 +55,9 @@ const JOINT: usize = 2500;
 
 /// Share of the way that training may move the pose of a time which shows an object whole.
 const LEAST_SHARE: f64 = 0.1;
+
+/// Turns about the upright axis, degrees in all, that rotations which following found are held against.
+const RIVALS: [i32; 6] = [-180, -120, -60, 60, 120, 180];
 
 /// An object with its motion.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -110,7 +114,7 @@ pub(super) struct Object<'a> {
     /// Place of the outline among those that the object may have: those beside the first suggest no ways of moving but
     /// what following finds.
     pub(super) place: usize,
-    /// Number of these outlines: several are compared with all pixels.
+    /// Number of these outlines.
     pub(super) outlines: usize,
     pub(super) surroundings: Surroundings<'a>,
 }
@@ -214,13 +218,14 @@ impl<'a> Object<'a> {
         is_told: bool,
         surroundings: Surroundings<'a>,
     ) -> Vec<Self> {
+        let count = outlines.len();
         let of = |(place, outline)| Object {
             label,
             views,
             outline,
             is_told,
             place,
-            outlines: outlines.len(),
+            outlines: count,
             surroundings,
         };
         outlines.iter().enumerate().map(of).collect()
@@ -348,8 +353,28 @@ impl<'a> Object<'a> {
         if !self.is_told && self.at_rest(&all).is_some_and(|rests| rests <= trials::REST_GAIN[1] * error) {
             return Ok(None);
         }
-        let (way, rotation) = (Way::Followed, RotationEvidence::Observed);
+        let rotation = if self.shows(&path, &fit.poses) {
+            RotationEvidence::Observed
+        } else {
+            RotationEvidence::Assumed
+        };
+        let way = Way::Followed;
         Ok(Some(Started { fit, path, way, rotation, error, unturned: None, bent: None, reference }))
+    }
+
+    /// True where the judge tells rotations that following found from none, and from turns about the upright axis.
+    fn shows(&self, path: &BTreeMap<usize, DVec3>, poses: &BTreeMap<usize, Pose>) -> bool {
+        let up = self.surroundings.plane.map_or(self.surroundings.up, |plane| plane.normal);
+        let (Some(first), Some(last)) = (path.keys().next(), path.keys().next_back()) else { return false };
+        let turning = |degrees: i32| {
+            let angle =
+                |time: usize| (time - first) as f64 / (last - first).max(1) as f64 * f64::from(degrees);
+            let rotation = |time: usize| DQuat::from_axis_angle(up, angle(time).to_radians());
+            path.iter().map(|(t, place)| (*t, Pose { rotation: rotation(*t), translation: *place })).collect()
+        };
+        let Some(mut judge) = Judge::new(self.views, self.outline.size(), turning(0)) else { return false };
+        judge.add(std::iter::once(poses.clone()).chain(RIVALS.map(turning)).collect());
+        judge.verdict().is_some_and(|found| found.best == 1 && found.is_observed)
     }
 
     /// The place where views see it together.
