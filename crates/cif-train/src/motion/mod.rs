@@ -5,12 +5,18 @@
 //! | `evidence` | which pixels judge |
 //! | `hull` | the shape of an object under a hypothesis, and what pixels see of it |
 //! | `judge` | which rotation they show, and whether they do |
+//! | `layered`, `shaded` | how well paint and light explain pixels left out |
+//! | `folds`, `compare` | which pixels are left out, and by how many standard errors one hypothesis is better |
 //! | `pauses` | when what turns in place turns |
 
+mod compare;
 mod evidence;
+mod folds;
 mod hull;
 mod judge;
+mod layered;
 mod pauses;
+mod shaded;
 #[cfg(test)]
 mod tests;
 

@@ -1,0 +1,73 @@
+//! Hypotheses held against each other on pixels that both predict, with standard errors.
+
+use rayon::prelude::*;
+
+use super::evidence::Evidence;
+
+/// Blocks of time of the jackknife, and the fewest with which a standard error is one.
+const JACKKNIFE: usize = 12;
+const FEWEST_BLOCKS: usize = 5;
+
+/// Pixels that two hypotheses must predict in a view to be compared there.
+const COMMON: u32 = 15;
+
+/// Standard errors by which every hypothesis beats every other (positive: it is better); NaN where they cannot be
+/// compared. Differences are means over the pixels of a view that both predict, then over views; their standard error is
+/// that of a jackknife over blocks of time.
+pub(super) fn compared(evidence: &Evidence<'_>, fields: &[&[f32]]) -> Vec<Vec<f64>> {
+    let mut bounds = vec![0];
+    for look in &evidence.looks {
+        bounds.push(bounds[bounds.len() - 1] + look.pixels.len());
+    }
+    let mut times: Vec<usize> = evidence.looks.iter().map(|look| look.view.time_index).collect();
+    times.dedup();
+    let of_view = |a: &[f32], b: &[f32], view: usize| {
+        let range = bounds[view]..bounds[view + 1];
+        let (mut sum, mut count) = (0.0_f64, 0_u32);
+        for (a, b) in a[range.clone()].iter().zip(&b[range]) {
+            if !a.is_nan() && !b.is_nan() {
+                sum += f64::from(b - a);
+                count += 1;
+            }
+        }
+        (count >= COMMON).then(|| sum / f64::from(count))
+    };
+    let pair = |a: usize, b: usize| {
+        let views = (0..evidence.looks.len()).filter_map(|view| {
+            Some((evidence.looks[view].view.time_index, of_view(fields[a], fields[b], view)?))
+        });
+        standard_errors(&views.collect::<Vec<_>>())
+    };
+    let count = fields.len();
+    let rows: Vec<Vec<f64>> =
+        (0..count).into_par_iter().map(|a| (0..a).map(|b| pair(a, b)).collect()).collect();
+    let at = |a: usize, b: usize| match a.cmp(&b) {
+        std::cmp::Ordering::Greater => rows[a][b],
+        std::cmp::Ordering::Less => -rows[b][a],
+        std::cmp::Ordering::Equal => 0.0,
+    };
+    (0..count).map(|a| (0..count).map(|b| at(a, b)).collect()).collect()
+}
+
+/// Mean of differences by time over its standard error, by a jackknife over blocks of time; NaN where these are few.
+fn standard_errors(differences: &[(usize, f64)]) -> f64 {
+    let mut times: Vec<usize> = differences.iter().map(|(time, _)| *time).collect();
+    times.sort_unstable();
+    times.dedup();
+    let blocks = JACKKNIFE.min(times.len());
+    if blocks < FEWEST_BLOCKS {
+        return f64::NAN;
+    }
+    let (mut sums, mut counts) = (vec![0.0; blocks], vec![0.0; blocks]);
+    for (time, difference) in differences {
+        let block = times.partition_point(|other| other < time) * blocks / times.len();
+        sums[block] += difference;
+        counts[block] += 1.0;
+    }
+    let (sum, count): (f64, f64) = (sums.iter().sum(), counts.iter().sum());
+    let without: Vec<f64> = sums.iter().zip(&counts).map(|(s, c)| (sum - s) / (count - c)).collect();
+    let mean = without.iter().sum::<f64>() / blocks as f64;
+    let spread: f64 = without.iter().map(|value| (value - mean).powi(2)).sum();
+    let error = ((blocks as f64 - 1.0) / blocks as f64 * spread).sqrt();
+    sum / count / (error + 1e-12)
+}
