@@ -55,6 +55,10 @@ const FOLLOW_GAIN: [f64; 2] = [0.98, 0.85];
 const STRAINED: f64 = 1.15;
 const OFF_GAIN: f64 = 0.85;
 
+/// Largest error of turning as the texture suggests, relative to the best other way, at which it is assumed: a few
+/// Gaussians without texture prefer no turn.
+const TEXTURE_GAIN: f64 = 1.3;
+
 /// Largest error of rolling, relative to that of sliding, at which it is assumed where no turn is told.
 const ROLLS_AS_WELL: f64 = 1.015;
 
@@ -481,8 +485,9 @@ fn errors(trials: &[Trial<'_>]) -> Vec<(Way, f64)> {
     trials.iter().map(|trial| (trial.way, trial.losses[1])).collect()
 }
 
-/// The way that is assumed where the judge cannot tell the rotation, by the errors of those that were tried: what is round
-/// and touches its support rolls, what following explains far better is followed, all else slides without a turn.
+/// The way that is assumed where the judge cannot tell the rotation, by the errors of those that were tried: what has a
+/// texture that suggests turns takes these, what following explains far better is followed, what is round and touches its
+/// support rolls, all else slides without a turn.
 fn assumed(tried: &[(Way, f64)], outline: &Outline) -> Way {
     let (is_round, in_contact) = (is_round(outline), outline.air.is_empty());
     let error = |wanted: &dyn Fn(&Way) -> bool| {
@@ -490,6 +495,9 @@ fn assumed(tried: &[(Way, f64)], outline: &Outline) -> Way {
     };
     let slides = error(&|way| *way == Way::Slide(0));
     let rolls = error(&|way| matches!(way, Way::Roll(_)));
+    if error(&|way| *way == Way::Textured) <= TEXTURE_GAIN * error(&|way| *way != Way::Textured) {
+        return Way::Textured;
+    }
     if error(&|way| *way == Way::Followed) < FOLLOW_GAIN[usize::from(is_round)] * slides.min(rolls) {
         return Way::Followed;
     }
@@ -519,5 +527,7 @@ mod tests {
         assert_eq!(assumed(&with((Way::Followed, 0.05)), &round), Way::Followed);
         assert_eq!(assumed(&with((Way::Followed, 0.09)), &round), Way::Slide(0));
         assert_eq!(assumed(&with((Way::Followed, 0.2)), &edgy), Way::Slide(0));
+        assert_eq!(assumed(&with((Way::Textured, 0.12)), &round), Way::Textured);
+        assert_eq!(assumed(&with((Way::Textured, 0.14)), &round), Way::Slide(0));
     }
 }

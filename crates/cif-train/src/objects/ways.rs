@@ -191,6 +191,9 @@ impl Paths<'_> {
         if self.followed.is_some() {
             ways.push(Way::Followed);
         }
+        if self.textured.is_some() {
+            ways.push(Way::Textured);
+        }
         let mut tried = Vec::new();
         ways.retain(|way| {
             !tried.contains(way) && {
