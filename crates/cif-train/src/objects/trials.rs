@@ -59,8 +59,9 @@ const OFF_GAIN: f64 = 0.85;
 /// Gaussians without texture prefer no turn.
 const TEXTURE_GAIN: f64 = 1.3;
 
-/// Largest error of rolling, relative to that of sliding, at which it is assumed where no turn is told.
-const ROLLS_AS_WELL: f64 = 1.015;
+/// Largest error of rolling, relative to that of sliding, at which it is assumed: of what touches its support and may
+/// roll as well, and of what leaves it.
+const ROLLS: [f64; 2] = [1.015, 0.94];
 
 /// Gaussians and steps of trials with all pixels.
 const FINE: (usize, usize) = (800, 1500);
@@ -71,6 +72,8 @@ struct Judged {
     way: Way,
     /// Its place among the hypotheses.
     place: usize,
+    /// The best way of rolling, of those that were tried.
+    roll: Option<Way>,
     is_observed: bool,
 }
 
@@ -233,9 +236,12 @@ impl<'a> Contest<'a> {
         ways.extend(beside);
         // Shading, which stays where it is, looks like paint that does: of what may roll it does not tell that it slides.
         let may_hide = self.paths.shifts() && self.paths.may_roll();
+        let rolls = (0..ways.len()).filter(|k| matches!(ways[*k], Way::Roll(_)));
+        let roll = judge.best_of(rolls).map(|k| ways[k]);
         Ok(judge.verdict().map(|found| Judged {
             way: ways[found.best],
             place: found.best,
+            roll,
             is_observed: found.is_observed && (found.turns || !may_hide),
         }))
     }
@@ -331,7 +337,7 @@ impl<'a> Contest<'a> {
                 return Ok((trials, (judged.way, RotationEvidence::Observed)));
             }
         }
-        let tried = self.paths.unobserved(judged.map(|judged| judged.way));
+        let tried = self.paths.unobserved(judged.map(|judged| [Some(judged.way), judged.roll]));
         let tried: Vec<Way> = tried.into_iter().filter(|way| *way != Way::Slide(0)).collect();
         let mut more = self.begin(&tried, GAUSSIANS);
         self.advance(&mut more, (0, STEPS[1]), false)?;
@@ -494,15 +500,17 @@ fn assumed(tried: &[(Way, f64)], outline: &Outline) -> Way {
         tried.iter().filter(|(way, _)| wanted(way)).map(|(_, error)| *error).fold(f64::INFINITY, f64::min)
     };
     let slides = error(&|way| *way == Way::Slide(0));
-    let rolls = error(&|way| matches!(way, Way::Roll(_)));
+    let rolling = tried.iter().filter(|(way, _)| matches!(way, Way::Roll(_)));
+    let (roll, rolls) =
+        rolling.min_by(|a, b| a.1.total_cmp(&b.1)).copied().unwrap_or((Way::Slide(0), f64::INFINITY));
     if error(&|way| *way == Way::Textured) <= TEXTURE_GAIN * error(&|way| *way != Way::Textured) {
         return Way::Textured;
     }
     if error(&|way| *way == Way::Followed) < FOLLOW_GAIN[usize::from(is_round)] * slides.min(rolls) {
         return Way::Followed;
     }
-    let may_roll = in_contact && rolls.is_finite() && (is_round || rolls <= ROLLS_AS_WELL * slides);
-    if may_roll { Way::Roll(1.0) } else { Way::Slide(0) }
+    let explains = rolls <= ROLLS[usize::from(!in_contact)] * slides;
+    if explains || (is_round && in_contact && rolls.is_finite()) { roll } else { Way::Slide(0) }
 }
 
 #[cfg(test)]
@@ -523,6 +531,7 @@ mod tests {
         assert_eq!(assumed(&with((Way::Roll(1.0), 0.102)), &edgy), Way::Slide(0));
         assert_eq!(assumed(&with((Way::Roll(1.0), 0.102)), &outline(1.0, Vec::new())), Way::Roll(1.0));
         assert_eq!(assumed(&with((Way::Roll(1.0), 0.099)), &outline(0.7, vec![3])), Way::Slide(0));
+        assert_eq!(assumed(&with((Way::Roll(0.9), 0.09)), &outline(0.7, vec![3])), Way::Roll(0.9));
         assert_eq!(assumed(&with((Way::Followed, 0.2)), &round), Way::Slide(0));
         assert_eq!(assumed(&with((Way::Followed, 0.05)), &round), Way::Followed);
         assert_eq!(assumed(&with((Way::Followed, 0.09)), &round), Way::Slide(0));

@@ -182,9 +182,9 @@ impl Paths<'_> {
         }
     }
 
-    /// Ways to try where the judge cannot tell: that which it prefers, and what may be assumed.
-    pub(super) fn unobserved(&self, preferred: Option<Way>) -> Vec<Way> {
-        let mut ways: Vec<Way> = preferred.into_iter().collect();
+    /// Ways to try where the judge cannot tell: those that it prefers, and what may be assumed.
+    pub(super) fn unobserved(&self, preferred: Option<[Option<Way>; 2]>) -> Vec<Way> {
+        let mut ways: Vec<Way> = preferred.into_iter().flatten().flatten().collect();
         if self.may_roll() {
             ways.push(Way::Roll(1.0));
         }
