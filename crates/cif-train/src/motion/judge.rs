@@ -141,16 +141,6 @@ impl<'a> Judge<'a> {
         compared(&self.evidence, &fields)[0][1] > 0.0
     }
 
-    /// Of some hypotheses the one that beats no turn by most standard errors.
-    pub(crate) fn best_of(&self, places: impl Iterator<Item = usize>) -> Option<usize> {
-        let over_none = |k: usize| {
-            let fields: Vec<&[f32]> = [k, 0].map(|k| &self.residuals[k].layered[..]).to_vec();
-            (k, compared(&self.evidence, &fields)[0][1])
-        };
-        let told = places.map(over_none).filter(|(_, margin)| !margin.is_nan());
-        told.max_by(|a, b| a.1.total_cmp(&b.1)).map(|(k, _)| k)
-    }
-
     /// The finding about the hypotheses so far; `None` where none can be compared with another.
     pub(crate) fn verdict(&self) -> Option<Verdict> {
         let times: Vec<usize> = self.evidence.looks.iter().map(|look| look.view.time_index).collect();

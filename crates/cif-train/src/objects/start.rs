@@ -172,8 +172,8 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
         (0.6 * decay, 1.5 * decay, level)
     });
     phases.check()?;
-    if let (RotationEvidence::Assumed, Way::Roll(factor), Some(plane)) =
-        (rotation, way, object.surroundings.plane)
+    if let (RotationEvidence::Assumed, Way::Roll(factor), Some(plane), None) =
+        (rotation, way, object.surroundings.plane, fit.rolls)
     {
         roll_along(&mut fit, plane, outline.height / factor);
         if let Some(shape) = object.hull(&fit.poses, GAUSSIANS, &mut object.rng()) {

@@ -55,15 +55,32 @@ const FOLLOW_GAIN: [f64; 2] = [0.98, 0.85];
 const STRAINED: f64 = 1.15;
 const OFF_GAIN: f64 = 0.85;
 
-/// Largest error of turning as the texture suggests, relative to the best other way, at which it is assumed: a few
-/// Gaussians without texture prefer no turn.
+/// Largest error of turning as texture tells, relative to the best other way: a few Gaussians without texture prefer
+/// no turn.
 const TEXTURE_GAIN: f64 = 1.3;
 
-/// Largest error of rolling, relative to that of sliding, at which it is assumed: of what touches its support and may
-/// roll as well, and of what leaves it.
-const ROLLS: [f64; 2] = [1.015, 0.94];
+/// Largest error of rolling, relative to that of sliding, at which rolling is preferred: of most objects, and of round
+/// ones.
+const ROLL_GAIN: [f64; 2] = [0.97, 0.94];
 
-/// Gaussians and steps of trials with all pixels.
+/// Error by which rivals must be told apart, relative: of most objects, and of round ones, whose shading prefers no
+/// turn; and the turn from which they are rivals, degrees.
+const RIVAL: ([f64; 2], i32) = ([1.02, 1.06], 60);
+
+/// Largest error of rolling, relative to that of sliding, at which it is assumed where no turn is told.
+const ROLLS_AS_WELL: f64 = 1.015;
+
+/// The same of sliding with a turn of [`RIVAL`] degrees or more, which few things do.
+const ROLLS_RATHER: f64 = 1.03;
+
+/// Difference of errors up to which turns of round things are the same.
+const SAME: f64 = 0.002;
+
+/// Most rivals that are tried again with all pixels, of paths and of rolls, their errors relative to the best, of
+/// rolls the second, and Gaussians and steps.
+const RIVALS: usize = 3;
+const CLOSE: f64 = 1.12;
+const FAR: f64 = 1.3;
 const FINE: (usize, usize) = (800, 1500);
 
 /// Finding of the judge about ways of moving.
@@ -72,8 +89,6 @@ struct Judged {
     way: Way,
     /// Its place among the hypotheses.
     place: usize,
-    /// The best way of rolling, of those that were tried.
-    roll: Option<Way>,
     is_observed: bool,
 }
 
@@ -153,12 +168,13 @@ pub(super) fn best_way<'a>(
         return Ok(None);
     }
     // The path of a ball whose turn does not show is best where none is looked for; its rolling is put on afterwards.
-    let rolls_unseen = rotation == RotationEvidence::Assumed && matches!(way, Way::Roll(_));
-    let slides = error_of(&trials, Way::Slide(0)).is_some();
-    let kept = if rolls_unseen && slides { Way::Slide(0) } else { way };
+    let [slides, rolls] = [Way::Slide(0), way].map(|way| error_of(&trials, way));
+    let explains = |(slides, rolls): (f64, f64)| rolls <= ROLL_GAIN[usize::from(is_round(outline))] * slides;
+    let rolls_unseen = rotation == RotationEvidence::Assumed
+        && matches!(way, Way::Roll(_))
+        && slides.zip(rolls).is_some_and(|errors| !explains(errors));
+    let kept = if rolls_unseen { Way::Slide(0) } else { way };
     let Some(trial) = trials.into_iter().find(|trial| trial.way == kept) else { return Ok(None) };
-    // One of several outlines is chosen with all pixels.
-    let trial = if object.outlines > 1 && !is_round(outline) { contest.refined(trial)? } else { trial };
     let Trial { mut fit, losses, .. } = trial;
     let bent = (losses[1] > DOUBTED && !object.is_told)
         .then(|| bend::bent(&fit, (&contest.train, contest.judged_views()), fit.trial_level()));
@@ -176,8 +192,12 @@ pub(super) fn best_way<'a>(
         fit.poses.values_mut().for_each(|pose| pose.rotation = DQuat::IDENTITY);
     }
     (fit.turns, fit.rolls) = match (rotation, way) {
-        (RotationEvidence::Assumed, Way::Roll(_)) | (_, Way::Followed) => (Turns::Free, None),
-        (RotationEvidence::Assumed, _) => (Turns::Given, None),
+        (RotationEvidence::Assumed, Way::Roll(factor)) => {
+            (Turns::Free, (!rolls_unseen).then(|| outline.height / factor))
+        }
+        // Light, which stays where it is, would pull them back.
+        (RotationEvidence::Assumed, Way::Textured | Way::Slide(0)) => (Turns::Given, None),
+        (RotationEvidence::Assumed, _) | (_, Way::Followed) => (Turns::Free, None),
         // As the judge had it.
         (RotationEvidence::Observed, _) => (fit.turns, fit.rolls),
     };
@@ -236,12 +256,9 @@ impl<'a> Contest<'a> {
         ways.extend(beside);
         // Shading, which stays where it is, looks like paint that does: of what may roll it does not tell that it slides.
         let may_hide = self.paths.shifts() && self.paths.may_roll();
-        let rolls = (0..ways.len()).filter(|k| matches!(ways[*k], Way::Roll(_)));
-        let roll = judge.best_of(rolls).map(|k| ways[k]);
         Ok(judge.verdict().map(|found| Judged {
             way: ways[found.best],
             place: found.best,
-            roll,
             is_observed: found.is_observed && (found.turns || !may_hide),
         }))
     }
@@ -327,39 +344,46 @@ impl<'a> Contest<'a> {
         }
         let judge = self.judge_of(Way::Slide(0));
         let mut trials = simple;
-        let mut judged = None;
         if let Some(mut judge) = judge {
-            judged = self.judged(&mut judge, self.paths.ways())?;
+            let judged = self.judged(&mut judge, self.paths.ways())?;
             if let Some(judged) = judged.filter(|judged| judged.is_observed) {
-                if judged.way != Way::Slide(0) {
-                    trials.extend(self.observed(&mut judge, judged, false)?);
-                }
+                // One of several outlines is chosen with all pixels.
+                let finely = self.object.outlines > 1 && !is_round(self.object.outline);
+                trials.retain(|trial| trial.way != judged.way);
+                trials.extend(self.observed(&mut judge, judged, finely)?);
                 return Ok((trials, (judged.way, RotationEvidence::Observed)));
             }
         }
-        let tried = self.paths.unobserved(judged.map(|judged| [Some(judged.way), judged.roll]));
-        let tried: Vec<Way> = tried.into_iter().filter(|way| *way != Way::Slide(0)).collect();
-        let mut more = self.begin(&tried, GAUSSIANS);
-        self.advance(&mut more, (0, STEPS[1]), false)?;
-        self.judge(&mut more, false);
-        trials.extend(more);
-        let way = assumed(&errors(&trials), self.object.outline);
+        let trials = self.unobserved(trials)?;
+        let way = decide(&errors(&trials), self.object.outline);
         Ok((trials, (way, RotationEvidence::Assumed)))
     }
 
-    /// A trial that goes on with all pixels and small Gaussians.
-    fn refined(&self, trial: Trial<'a>) -> Result<Trial<'a>, TrainError> {
-        let Trial { way, fit, losses } = trial;
-        let mut rng = self.object.rng();
-        let Some(shape) = self.object.hull(&fit.poses, FINE.0, &mut rng) else {
-            return Ok(Trial { way, fit, losses });
-        };
-        let mut fit = Fit { shape, rng, ..fit };
-        fit.poses.retain(|time, _| !self.between.contains(time));
-        let mut trials = vec![Trial { way, fit, losses }];
-        self.advance(&mut trials, (0, FINE.1), true)?;
-        self.judge(&mut trials, true);
-        Ok(trials.remove(0))
+    /// Trials of an object whose rotation the judge does not tell: of the turns that its texture suggests or else of all
+    /// ways along the path, those near the best with all pixels.
+    fn unobserved(&self, simple: Vec<Trial<'a>>) -> Result<Vec<Trial<'a>>, TrainError> {
+        let least = simple.iter().map(|trial| trial.losses[1]).fold(f64::INFINITY, f64::min);
+        if self.paths.textured.is_some() {
+            let mut trials = self.begin(&[Way::Textured], GAUSSIANS);
+            self.advance(&mut trials, (0, STEPS[1]), false)?;
+            self.judge(&mut trials, false);
+            if trials.first().is_some_and(|trial| trial.losses[1] <= TEXTURE_GAIN * least) {
+                return Ok(trials);
+            }
+        }
+        let mut trials = simple;
+        let mut more = self.begin(&self.paths.unobserved(self.object.place), GAUSSIANS);
+        self.advance(&mut more, (0, STEPS[0]), false)?;
+        give_up_hopeless(&mut more, |way| matches!(way, Way::Followed | Way::Roll(_)));
+        self.advance(&mut more, (STEPS[0], STEPS[1]), false)?;
+        self.judge(&mut more, false);
+        trials.extend(more);
+        let rivals = rivals(&trials);
+        // Shading prefers no turn of round things, at any resolution.
+        if is_round(self.object.outline) || (rivals.len() < 2 && self.object.outlines < 2) {
+            return Ok(trials);
+        }
+        self.finely(&rivals)
     }
 
     /// Trials with all pixels and small Gaussians, where fine texture may tell.
@@ -491,26 +515,80 @@ fn errors(trials: &[Trial<'_>]) -> Vec<(Way, f64)> {
     trials.iter().map(|trial| (trial.way, trial.losses[1])).collect()
 }
 
-/// The way that is assumed where the judge cannot tell the rotation, by the errors of those that were tried: what has a
-/// texture that suggests turns takes these, what following explains far better is followed, what is round and touches its
-/// support rolls, all else slides without a turn.
-fn assumed(tried: &[(Way, f64)], outline: &Outline) -> Way {
+/// Ways that are near the best: paths, rolls, and what following found.
+fn rivals(trials: &[Trial<'_>]) -> Vec<Way> {
+    let mut best = errors(trials);
+    best.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let is_near = |factor: f64, error: f64| error < factor * best[0].1;
+    let (mut paths, mut rolls, mut rivals) = (0, 0, Vec::new());
+    for (way, error) in &best {
+        // What turns about a long axis shows it by its texture alone.
+        let (count, most, factor) = match way {
+            Way::Roll(_) => (&mut rolls, RIVALS, FAR),
+            Way::Rest | Way::Followed => (&mut 0, 1, FAR),
+            _ => (&mut paths, RIVALS, CLOSE),
+        };
+        if *count < most && is_near(factor, *error) {
+            *count += 1;
+            rivals.push(*way);
+        }
+    }
+    rivals
+}
+
+/// The way of moving that is assumed where the judge cannot tell the rotation, by the errors of those that were tried.
+fn decide(tried: &[(Way, f64)], outline: &Outline) -> Way {
     let (is_round, in_contact) = (is_round(outline), outline.air.is_empty());
-    let error = |wanted: &dyn Fn(&Way) -> bool| {
-        tried.iter().filter(|(way, _)| wanted(way)).map(|(_, error)| *error).fold(f64::INFINITY, f64::min)
+    let best = |wanted: &dyn Fn(&Way) -> bool| {
+        tried.iter().filter(|(way, _)| wanted(way)).min_by(|a, b| a.1.total_cmp(&b.1)).copied()
     };
-    let slides = error(&|way| *way == Way::Slide(0));
-    let rolling = tried.iter().filter(|(way, _)| matches!(way, Way::Roll(_)));
-    let (roll, rolls) =
-        rolling.min_by(|a, b| a.1.total_cmp(&b.1)).copied().unwrap_or((Way::Slide(0), f64::INFINITY));
-    if error(&|way| *way == Way::Textured) <= TEXTURE_GAIN * error(&|way| *way != Way::Textured) {
-        return Way::Textured;
+    let Some((moving, moving_error)) = best(&|way| *way != Way::Rest) else { return Way::Slide(0) };
+    let roll = best(&|way| matches!(way, Way::Roll(_)));
+    let Some((turning, turning_error)) = best(&|way| way.degrees().is_some()) else {
+        return moving;
+    };
+    let others = roll.map_or(turning_error, |(_, error)| error.min(turning_error));
+    if moving == Way::Followed && moving_error < FOLLOW_GAIN[usize::from(is_round)] * others {
+        return moving;
     }
-    if error(&|way| *way == Way::Followed) < FOLLOW_GAIN[usize::from(is_round)] * slides.min(rolls) {
-        return Way::Followed;
+    if let Some((way, error)) = roll
+        && error <= ROLL_GAIN[usize::from(is_round)] * turning_error
+    {
+        return way;
     }
-    let explains = rolls <= ROLLS[usize::from(!in_contact)] * slides;
-    if explains || (is_round && in_contact && rolls.is_finite()) { roll } else { Way::Slide(0) }
+    let turns_far = turning.degrees().is_some_and(|degrees| degrees.abs() >= RIVAL.1);
+    if let Some((way, error)) = roll
+        && in_contact
+        && turns_far
+        && error <= ROLLS_RATHER * turning_error
+    {
+        return way;
+    }
+    let apart = |other: i32| {
+        let difference = (other - turning.degrees().unwrap_or(0)).rem_euclid(360);
+        difference.min(360 - difference) >= RIVAL.1
+    };
+    let rival = best(&|way| way.degrees().is_some_and(apart));
+    let same = if is_round { SAME } else { 0.0 };
+    let least = (RIVAL.0[usize::from(is_round)] * turning_error).max(turning_error + same);
+    let has = |wanted: Way| tried.iter().any(|(way, _)| *way == wanted);
+    // Where no turn of something round was tried, none is known.
+    let is_untried = is_round && tried.iter().filter(|(way, _)| way.degrees().is_some()).count() < 2;
+    if is_untried || rival.is_some_and(|(_, error)| error < least) {
+        if is_round && in_contact && has(Way::Roll(1.0)) {
+            return Way::Roll(1.0);
+        }
+        // What may roll without a change of its outline is made to.
+        let rolls_as_well = |(_, error): &(Way, f64)| *error <= ROLLS_AS_WELL * turning_error;
+        if let Some((way, _)) = roll.filter(|roll| in_contact && rolls_as_well(roll)) {
+            return way;
+        }
+        if has(Way::Slide(0)) {
+            return Way::Slide(0);
+        }
+        return turning;
+    }
+    turning
 }
 
 #[cfg(test)]
@@ -524,19 +602,25 @@ mod tests {
             air,
             ..shaped((0.05, 0.05), roundness, BTreeMap::new())
         };
-        let with = |more: (Way, f64)| [(Way::Slide(0), 0.1), more];
+        let slides = [(Way::Slide(0), 0.1), (Way::Slide(90), 0.101)];
+        let with = |more: &[(Way, f64)]| [&slides[..], more].concat();
         let (edgy, round) = (outline(0.7, Vec::new()), outline(1.0, vec![3]));
+
         // What may roll does, where it explains as much as sliding, and touches its support.
-        assert_eq!(assumed(&with((Way::Roll(1.0), 0.101)), &edgy), Way::Roll(1.0));
-        assert_eq!(assumed(&with((Way::Roll(1.0), 0.102)), &edgy), Way::Slide(0));
-        assert_eq!(assumed(&with((Way::Roll(1.0), 0.102)), &outline(1.0, Vec::new())), Way::Roll(1.0));
-        assert_eq!(assumed(&with((Way::Roll(1.0), 0.099)), &outline(0.7, vec![3])), Way::Slide(0));
-        assert_eq!(assumed(&with((Way::Roll(0.9), 0.09)), &outline(0.7, vec![3])), Way::Roll(0.9));
-        assert_eq!(assumed(&with((Way::Followed, 0.2)), &round), Way::Slide(0));
-        assert_eq!(assumed(&with((Way::Followed, 0.05)), &round), Way::Followed);
-        assert_eq!(assumed(&with((Way::Followed, 0.09)), &round), Way::Slide(0));
-        assert_eq!(assumed(&with((Way::Followed, 0.2)), &edgy), Way::Slide(0));
-        assert_eq!(assumed(&with((Way::Textured, 0.12)), &round), Way::Textured);
-        assert_eq!(assumed(&with((Way::Textured, 0.14)), &round), Way::Slide(0));
+        assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.101)]), &edgy), Way::Roll(0.8));
+        assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.102)]), &edgy), Way::Slide(0));
+        assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.099)]), &outline(0.7, vec![3])), Way::Slide(0));
+        // What would have to turn far while it slides rolls, even a little worse.
+        let turning = [(Way::Slide(-120), 0.1), (Way::Roll(1.08), 0.102)];
+        assert_eq!(decide(&turning, &edgy), Way::Roll(1.08));
+
+        assert_eq!(decide(&[(Way::Slide(-30), 0.1), turning[1]], &edgy), Way::Slide(-30));
+        assert_eq!(decide(&[turning[0], (Way::Roll(1.08), 0.104)], &edgy), Way::Slide(-120));
+        // Of a ball in the air no turn was tried but those that following found.
+        assert_eq!(decide(&[slides[0], (Way::Followed, 0.2)], &round), Way::Slide(0));
+        let followed = Way::Followed;
+        assert_eq!(decide(&[slides[0], (Way::Followed, 0.05)], &round), followed);
+        assert_eq!(decide(&[slides[0], (Way::Followed, 0.09)], &round), Way::Slide(0));
+        assert_eq!(decide(&[slides[0], (Way::Followed, 0.2)], &edgy), Way::Slide(0));
     }
 }

@@ -23,6 +23,12 @@ const SPINS_TO: i32 = 360;
 /// of balls well and that of other things, which roll about another axis than their middle, by half.
 const ROLLS: (f64, f64) = (0.75, 1.6);
 
+/// The same of fits where the judge does not tell, and rolling radii tried then, of the height: of balls, and of other
+/// things, whose height tells it less well.
+const ASSUMED: i32 = 30;
+const ASSUMED_ROLLS: [f64; 9] = [0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08];
+const OTHER_ROLLS: [f64; 12] = [0.64, 0.68, 0.72, 0.76, 0.8, 0.84, 0.88, 0.92, 0.96, 1.0, 1.04, 1.08];
+
 /// Difference of the whole turns of courses that are tried, degrees: the judge takes turns within 30 degrees as the same.
 const GRID: f64 = 30.0;
 
@@ -81,6 +87,14 @@ impl Way {
             Self::Followed => "followed from time to time".to_owned(),
             Self::Scaled(share) => format!("followed from time to time, turning {share:.2} as far"),
             Self::Textured => "turns as its texture tells".to_owned(),
+        }
+    }
+
+    /// Turn about the normal, degrees, of ways that are told apart by it.
+    pub(super) fn degrees(self) -> Option<i32> {
+        match self {
+            Self::Slide(degrees) | Self::Spin(degrees) | Self::Pausing(degrees) => Some(degrees),
+            _ => None,
         }
     }
 }
@@ -182,25 +196,20 @@ impl Paths<'_> {
         }
     }
 
-    /// Ways to try where the judge cannot tell: those that it prefers, and what may be assumed.
-    pub(super) fn unobserved(&self, preferred: Option<[Option<Way>; 2]>) -> Vec<Way> {
-        let mut ways: Vec<Way> = preferred.into_iter().flatten().flatten().collect();
-        if self.may_roll() {
-            ways.push(Way::Roll(1.0));
+    /// Ways to try where the judge cannot tell; of an outline at a place beside the first what following found alone.
+    pub(super) fn unobserved(&self, place: usize) -> Vec<Way> {
+        let mut ways = Vec::new();
+        if place == 0 || self.followed.is_none() {
+            let turns = (-180 / ASSUMED..=180 / ASSUMED).filter(|k| *k != 0);
+            ways.extend(turns.map(|k| Way::Slide(k * ASSUMED)));
+            if self.may_roll() {
+                let radii: &[f64] = if is_round(self.outline) { &ASSUMED_ROLLS } else { &OTHER_ROLLS };
+                ways.extend(radii.iter().map(|radius| Way::Roll(*radius)));
+            }
         }
         if self.followed.is_some() {
             ways.push(Way::Followed);
         }
-        if self.textured.is_some() {
-            ways.push(Way::Textured);
-        }
-        let mut tried = Vec::new();
-        ways.retain(|way| {
-            !tried.contains(way) && {
-                tried.push(*way);
-                true
-            }
-        });
         ways
     }
 
