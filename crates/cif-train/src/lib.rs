@@ -19,7 +19,6 @@
 //! | [`effects`] | what has to show while it trains that it is worth its cost, one file each |
 //! | [`estimate`] | whose each Gaussian is, from masks |
 //! | `engine` | what computes the steps of a run: the processor, or a GPU |
-//! | `motion` | how objects move, by evidence: the judge of rotations |
 //! | `objects` | how rigid objects get poses, before the scene is trained |
 //! | [`heads`] | what the instance stage learns, and how pixels tell it |
 //! | `switches` | which masks show another object than theirs |
@@ -71,7 +70,6 @@ mod mask_table;
 #[cfg(test)]
 mod measured;
 pub mod metrics;
-mod motion;
 mod objects;
 mod optimiser;
 pub mod phase;

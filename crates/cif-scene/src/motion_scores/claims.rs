@@ -3,8 +3,6 @@
 use cif_field::RotationEvidence;
 use serde::Serialize;
 
-use super::InstanceMotion;
-
 /// True rotation above which an instance turns, degrees: smaller ones are within reach of [`RIGHT_DEG`] without turning.
 const TURNS_DEG: f64 = 20.0;
 
@@ -33,12 +31,12 @@ pub struct Verdicts {
 }
 
 impl Claims {
-    /// Counts the instances whose rotation was measured.
-    pub(super) fn of(instances: &[InstanceMotion]) -> Self {
+    /// Counts instances whose rotation was measured: how far they truly turn and by how much that is missed, degrees, and
+    /// the claim.
+    pub(super) fn of(instances: impl Iterator<Item = (f64, f64, Option<RotationEvidence>)>) -> Self {
         let mut claims = Self::default();
-        for instance in instances.iter().filter(|instance| instance.turned_deg > Some(TURNS_DEG)) {
-            let Some(error) = instance.errors.rotation_deg else { continue };
-            let verdicts = match instance.claim {
+        for (_, error, claim) in instances.filter(|(turned, ..)| *turned > TURNS_DEG) {
+            let verdicts = match claim {
                 Some(RotationEvidence::Observed) => &mut claims.observed,
                 Some(RotationEvidence::Assumed) => &mut claims.assumed,
                 None => &mut claims.none,

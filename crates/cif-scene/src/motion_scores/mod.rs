@@ -148,7 +148,9 @@ pub fn motion_scores(
     MotionScores {
         moving: mean(&instances, true),
         resting: mean(&instances, false),
-        claims: Claims::of(&instances),
+        claims: Claims::of(instances.iter().filter_map(|instance| {
+            Some((instance.turned_deg?, instance.errors.rotation_deg?, instance.claim))
+        })),
         instances,
     }
 }

@@ -18,6 +18,7 @@
 //! | `trials` | which way is kept |
 //! | `bend` | whether it rather deforms |
 //! | `start` | everything in order |
+//! | `rotation` | whether the pictures show how it turns |
 //! | `parts` | which part of it turns on a hinge or slides |
 //! | `known` | what was found of all objects, saved with the run |
 
@@ -36,11 +37,12 @@ mod parts;
 mod path;
 mod plane;
 mod priors;
+mod rotation;
 mod shape;
 mod sphere;
 mod start;
 #[cfg(test)]
-pub(crate) mod testing;
+mod testing;
 #[cfg(test)]
 mod tests;
 mod texture;
@@ -56,11 +58,10 @@ pub(crate) use self::known::KnownObjects;
 pub(crate) use self::order::Order;
 pub(crate) use self::parts::Jointed;
 pub(crate) use self::plane::Plane;
-pub(crate) use self::shape::Pose;
 use self::start::Object;
 pub(crate) use self::start::{Fitted, Surroundings};
 pub(crate) use self::trials::BENDS_NO_BETTER;
-pub(crate) use self::view::{ObjectView, Seen};
+use self::view::ObjectView;
 use crate::error::TrainError;
 use crate::frames::FrameStore;
 use crate::phases::Phases;

@@ -19,12 +19,12 @@ use super::order::Order;
 use super::outline::{Outline, meeting_point};
 use super::path::smooth;
 use super::plane::Plane;
+use super::rotation::Judge;
 use super::shape::{Pose, Shape};
 use super::trials::{self, GAUSSIANS, STEPS};
 use super::view::{ObjectView, is_one_camera, median};
 use super::ways::{Way, rolled};
 use crate::error::TrainError;
-use crate::motion::Judge;
 use crate::phases::Phases;
 use crate::random::{Purpose, stream};
 
@@ -72,6 +72,8 @@ pub(crate) struct Fitted {
     /// Pose at the time that shows most of it.
     pub(crate) reference: (DQuat, DVec3),
     pub(crate) rotation: RotationEvidence,
+    /// True where no other turn fits as well, whether or not the judge observes this one.
+    pub(crate) is_turned: bool,
     /// Error on pixels that were left out.
     pub(crate) error: f64,
     /// The same, had it not turned.
@@ -126,6 +128,8 @@ pub(super) struct Started<'a> {
     pub(super) path: BTreeMap<usize, DVec3>,
     pub(super) way: Way,
     pub(super) rotation: RotationEvidence,
+    /// True where no other turn fits as well.
+    pub(super) is_turned: bool,
     pub(super) error: f64,
     /// Error of moving without a turn.
     pub(super) unturned: Option<f64>,
@@ -154,7 +158,8 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
         begun.extend(all(&resorts)?);
     }
     let best = begun.into_iter().min_by(|a, b| a.1.error.total_cmp(&b.1.error));
-    let Some((object, Started { mut fit, path, way, rotation, error, unturned, bent, reference })) = best
+    let Some((object, Started { mut fit, path, way, rotation, is_turned, error, unturned, bent, reference })) =
+        best
     else {
         return Ok(None);
     };
@@ -200,6 +205,7 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
         gaussians: fit.shape.gaussians().clone(),
         reference: fit.poses.get(&reference).map_or(at_rest, |p| (p.rotation, p.translation)),
         rotation,
+        is_turned,
         error,
         unturned,
         bent,
@@ -359,7 +365,8 @@ impl<'a> Object<'a> {
             RotationEvidence::Assumed
         };
         let way = Way::Followed;
-        Ok(Some(Started { fit, path, way, rotation, error, unturned: None, bent: None, reference }))
+        let (is_turned, unturned, bent) = (true, None, None);
+        Ok(Some(Started { fit, path, way, rotation, is_turned, error, unturned, bent, reference }))
     }
 
     /// True where the judge tells rotations that following found from none, and from turns about the upright axis.
@@ -374,7 +381,7 @@ impl<'a> Object<'a> {
         };
         let Some(mut judge) = Judge::new(self.views, self.outline.size(), turning(0)) else { return false };
         judge.add(std::iter::once(poses.clone()).chain(RIVALS.map(turning)).collect());
-        judge.verdict().is_some_and(|found| found.best == 1 && found.is_observed)
+        judge.tells(1)
     }
 
     /// The place where views see it together.

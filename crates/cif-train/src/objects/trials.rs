@@ -12,12 +12,12 @@ use super::fit::{Fit, Turns};
 use super::follow::follow;
 use super::outline::Outline;
 use super::path::smooth;
+use super::rotation::{Course, Judge};
 use super::start::{Object, Started};
 use super::texture;
 use super::view::ObjectView;
-use super::ways::{Bar, Paths, Way, is_round};
+use super::ways::{Bar, Paths, SMALLEST_SPIN, Way, is_round};
 use crate::error::TrainError;
-use crate::motion::Judge;
 
 /// Gaussians of a trial.
 pub(super) const GAUSSIANS: usize = 150;
@@ -35,6 +35,10 @@ pub(super) const REST_GAIN: [f64; 2] = [1.5, 1.15];
 /// Steps of poses of times that were left out.
 const SETTLE: usize = 40;
 
+/// Error of the smallest turn in place, relative to that of one whose angle the pictures do not tell, from which it turns
+/// at all: what deforms is explained by any of them.
+const SPIN_GAIN: f64 = 1.12;
+
 /// Error from which neither resting nor sliding explains what is seen, where one camera sees it from about one side and
 /// where it is seen from several, and that of a way that does, of it.
 const UNEXPLAINED: [f64; 2] = [0.3, 0.1];
@@ -46,8 +50,11 @@ const DOUBTED: f64 = 0.1;
 /// Error of bending, of that of a rigid object, from which it explains no better.
 pub(crate) const BENDS_NO_BETTER: f64 = 0.98;
 
-/// Error of an object that was followed, relative to that of paths, below which following is preferred where the judge
-/// cannot tell: of most objects, and of round ones, which it turns so that shading stays on them.
+/// Largest error of turning in place.
+const MOST_IN_PLACE: f64 = 0.1;
+
+/// Error of an object that was followed, relative to that of paths, below which following is preferred: of most
+/// objects, and of round ones, which it turns so that shading stays on them.
 const FOLLOW_GAIN: [f64; 2] = [0.98, 0.85];
 
 /// Error of an object on its support where it moves, relative to that where it rests, from which it may be off it, and
@@ -58,6 +65,9 @@ const OFF_GAIN: f64 = 0.85;
 /// Largest error of turning as texture tells, relative to the best other way: a few Gaussians without texture prefer
 /// no turn.
 const TEXTURE_GAIN: f64 = 1.3;
+
+/// The same of the turn of a bar about its long axis, which light, staying where it is, argues against.
+const LONG_GAIN: f64 = 1.6;
 
 /// Largest error of rolling, relative to that of sliding, at which rolling is preferred: of most objects, and of round
 /// ones.
@@ -82,15 +92,6 @@ const RIVALS: usize = 3;
 const CLOSE: f64 = 1.12;
 const FAR: f64 = 1.3;
 const FINE: (usize, usize) = (800, 1500);
-
-/// Finding of the judge about ways of moving.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Judged {
-    way: Way,
-    /// Its place among the hypotheses.
-    place: usize,
-    is_observed: bool,
-}
 
 /// A way of moving under way.
 struct Trial<'a> {
@@ -135,7 +136,6 @@ pub(super) fn best_way<'a>(
             reference,
             followed: None,
             off: Vec::new(),
-            pauses: None,
             textured: None,
         },
         train,
@@ -145,46 +145,45 @@ pub(super) fn best_way<'a>(
     let simple_errors = [Way::Rest, Way::Slide(0)].map(|way| error_of(&simple, way));
     let stays = rests(&simple, Way::Slide(0), REST_GAIN[0]);
     let is_unexplained = contest.is_unexplained(&simple);
-    let (trials, (way, rotation)) = if stays && !is_unexplained && !object.is_told {
-        // Where it rests, all its outlines put it into the same place.
-        let judge = if object.place == 0 { contest.judge_of(Way::Rest) } else { None };
-        let Some(mut judge) = judge else { return Ok(None) };
-        let Some(judged) = contest.judged(&mut judge, contest.paths.spins())? else { return Ok(None) };
-        if !judged.is_observed || judged.way == Way::Rest {
+    let trials = if let Some(textured) = contest.textured(&simple, reliable)? {
+        vec![textured]
+    } else if object.is_told {
+        contest.along_the_path(simple)?
+    } else if stays && !is_unexplained {
+        if !contest.paths.may_turn_unseen(views) {
             return Ok(None);
         }
-        let mut trials = contest.finely(&[Way::Rest])?;
-        trials.extend(contest.observed(&mut judge, judged, true)?);
-        (trials, (judged.way, RotationEvidence::Observed))
-    } else if object.is_told || contest.paths.shifts() || is_unexplained {
-        contest.along_the_path(simple, reliable)?
+        contest.finely(&contest.paths.spins())?
+    } else if contest.paths.shifts() || is_unexplained {
+        contest.along_the_path(simple)?
     } else {
         return Ok(None);
     };
-    // Turns that are observed need not show in the outline.
-    let gain =
-        if rotation == RotationEvidence::Observed && way != Way::Slide(0) { 1.0 } else { REST_GAIN[1] };
-    if !object.is_told && rests(&trials, way, gain) {
+    let moves = decide(&errors(&trials), outline)
+        .filter(|(way, _)| object.is_told || !rests(&trials, *way, REST_GAIN[1]));
+    let Some((way, rotation)) = moves else { return Ok(None) };
+    if rotation == RotationEvidence::Assumed && !object.is_told && !turns(|way| error_of(&trials, way), way) {
         return Ok(None);
     }
     // The path of a ball whose turn does not show is best where none is looked for; its rolling is put on afterwards.
-    let [slides, rolls] = [Way::Slide(0), way].map(|way| error_of(&trials, way));
-    let explains = |(slides, rolls): (f64, f64)| rolls <= ROLL_GAIN[usize::from(is_round(outline))] * slides;
-    let rolls_unseen = rotation == RotationEvidence::Assumed
-        && matches!(way, Way::Roll(_))
-        && slides.zip(rolls).is_some_and(|errors| !explains(errors));
-    let kept = if rolls_unseen { Way::Slide(0) } else { way };
-    let Some(trial) = trials.into_iter().find(|trial| trial.way == kept) else { return Ok(None) };
-    let Trial { mut fit, losses, .. } = trial;
+    let rolls_unseen = rotation == RotationEvidence::Assumed && matches!(way, Way::Roll(_));
+    let slides = error_of(&trials, Way::Slide(0)).is_some();
+    let kept = if rolls_unseen && slides { Way::Slide(0) } else { way };
+    let Some(Trial { mut fit, losses, .. }) = trials.into_iter().find(|trial| trial.way == kept) else {
+        return Ok(None);
+    };
     let bent = (losses[1] > DOUBTED && !object.is_told)
-        .then(|| bend::bent(&fit, (&contest.train, contest.judged_views()), fit.trial_level()));
+        .then(|| bend::bent(&fit, (&contest.train, contest.judged()), fit.trial_level()));
     // What stays in place and looks otherwise in every turn deforms, or opens. Of thin things the outline, which is never
     // exact, is most of what is seen: they are solid where bending explains no more.
     let most = match simple_errors[0] {
+        _ if matches!(way, Way::Spin(_)) => MOST_IN_PLACE,
         Some(rests) if stays && is_unexplained => EXPLAINED * rests,
         _ => f64::INFINITY,
     };
-    let may_be_solid = !outline.is_surrounded && bent.is_some_and(|bent| bent >= BENDS_NO_BETTER);
+    let may_be_solid = !outline.is_surrounded
+        && !matches!(way, Way::Spin(_))
+        && bent.is_some_and(|bent| bent >= BENDS_NO_BETTER);
     if losses[1] > most && !object.is_told && !may_be_solid {
         return Ok(None);
     }
@@ -192,20 +191,33 @@ pub(super) fn best_way<'a>(
         fit.poses.values_mut().for_each(|pose| pose.rotation = DQuat::IDENTITY);
     }
     (fit.turns, fit.rolls) = match (rotation, way) {
-        (RotationEvidence::Assumed, Way::Roll(factor)) => {
-            (Turns::Free, (!rolls_unseen).then(|| outline.height / factor))
-        }
-        // Light, which stays where it is, would pull them back.
-        (RotationEvidence::Assumed, Way::Textured | Way::Slide(0)) => (Turns::Given, None),
-        (RotationEvidence::Assumed, _) | (_, Way::Followed) => (Turns::Free, None),
-        // As the judge had it.
-        (RotationEvidence::Observed, _) => (fit.turns, fit.rolls),
+        (RotationEvidence::Assumed, Way::Roll(_)) => (Turns::Free, None),
+        (RotationEvidence::Assumed, _) => (Turns::Given, None),
+        (_, Way::Roll(factor)) => (Turns::Free, Some(outline.height / factor)),
+        // Light, which stays where it is, would pull it back.
+        (_, Way::Textured) => (Turns::Given, None),
+        _ => (Turns::Free, None),
     };
     let unturned = simple_errors[1];
-    Ok(Some(Started { fit, path, way, rotation, error: losses[1], unturned, bent, reference }))
+    let is_turned = rotation == RotationEvidence::Observed;
+    let rotation = if contest.shows(&fit.poses) { rotation } else { RotationEvidence::Assumed };
+    let error = losses[1];
+    Ok(Some(Started { fit, path, way, rotation, is_turned, error, unturned, bent, reference }))
 }
 
 impl<'a> Contest<'a> {
+    /// True where the judge tells the turns of poses from those of all ways that differ by more than 30 degrees.
+    fn shows(&self, poses: &Course) -> bool {
+        let paths = &self.paths;
+        let size = self.object.outline.size();
+        let Some(mut judge) = Judge::new(self.object.views, size, paths.poses(Way::Slide(0))) else {
+            return false;
+        };
+        let turns = paths.ways().into_iter().chain(paths.spins()).map(|way| paths.poses(way));
+        judge.add(std::iter::once(poses.clone()).chain(turns).collect());
+        judge.tells(1)
+    }
+
     /// Trials of resting, and of moving along the path without a turn: most objects that do not travel rest.
     fn simple(&self) -> Result<Vec<Trial<'a>>, TrainError> {
         let mut trials = self.begin(&[Way::Rest, Way::Slide(0)], GAUSSIANS);
@@ -214,12 +226,17 @@ impl<'a> Contest<'a> {
         Ok(trials)
     }
 
-    /// Poses that the texture of the object suggests, where it suggests any.
-    fn find_texture(&mut self, simple: &[Trial<'_>], reliable: &[usize]) {
+    /// Turning as texture tells, where it does and the outline says nothing else.
+    fn textured(
+        &mut self,
+        simple: &[Trial<'_>],
+        reliable: &[usize],
+    ) -> Result<Option<Trial<'a>>, TrainError> {
         let seen = reliable.iter().map(|view| &self.object.views[*view]);
         let (outline, up, reference) = (self.object.outline, self.paths.up, self.paths.reference);
         let slides = simple.iter().find(|trial| trial.way == Way::Slide(0)).map(|trial| &trial.fit);
         let bar = slides.and_then(|fit| Bar::of(fit.shape.gaussians(), &fit.poses, up));
+        let most = if bar.is_some() { LONG_GAIN } else { TEXTURE_GAIN };
         self.paths.textured = if let Some(bar) = bar {
             let rolled = bar.rolled(up, outline.height, reference);
             let turns = texture::rolls(seen, &bar.poses, (bar.axis, up), &rolled, outline);
@@ -233,56 +250,14 @@ impl<'a> Contest<'a> {
             }
             turns.map(|turns| self.paths.turned(&turns))
         };
-    }
-
-    /// A judge of the rotation of the object, and pauses that it sees; `unturned` is the way without turns.
-    fn judge_of(&mut self, unturned: Way) -> Option<Judge<'a>> {
-        let judge = Judge::new(self.object.views, self.object.outline.size(), self.paths.poses(unturned));
-        self.paths.pauses = judge.as_ref().and_then(Judge::pauses);
-        judge
-    }
-
-    /// The way, of those that agree on where the object is, that the judge of rotations finds: the first does not turn.
-    /// Ways beside the best are added, so that its amount is near. `None` where too little is seen to compare them.
-    fn judged(&self, judge: &mut Judge<'a>, mut ways: Vec<Way>) -> Result<Option<Judged>, TrainError> {
-        let phases = self.object.surroundings.phases;
-        let course = |way: &Way| self.paths.poses(*way);
-        judge.add(ways.iter().skip(1).map(course).collect());
-        phases.check()?;
-        let Some(found) = judge.verdict() else { return Ok(None) };
-        let beside = self.paths.beside(ways[found.best]);
-        judge.add(beside.iter().map(course).collect());
-        phases.check()?;
-        ways.extend(beside);
-        // Shading, which stays where it is, looks like paint that does: of what may roll it does not tell that it slides.
-        let may_hide = self.paths.shifts() && self.paths.may_roll();
-        Ok(judge.verdict().map(|found| Judged {
-            way: ways[found.best],
-            place: found.best,
-            is_observed: found.is_observed && (found.turns || !may_hide),
-        }))
-    }
-
-    /// A trial of an observed way: its turns stay as the judge found them, unless those that the pixels move them to
-    /// explain more: light, which stays where it is, pulls turns back.
-    fn observed(
-        &self,
-        judge: &mut Judge<'a>,
-        judged: Judged,
-        finely: bool,
-    ) -> Result<Vec<Trial<'a>>, TrainError> {
-        let way = judged.way;
-        let gaussians = if finely { FINE.0 } else { GAUSSIANS };
-        let steps = if finely { FINE.1 } else { STEPS[1] };
-        let mut trials = self.begin(&[way, way], gaussians);
-        if let Some(trial) = trials.first_mut().filter(|_| way != Way::Followed) {
-            (trial.fit.turns, trial.fit.rolls) = (Turns::Given, None);
+        if self.paths.textured.is_none() {
+            return Ok(None);
         }
-        self.advance(&mut trials, (0, steps), finely)?;
-        self.judge(&mut trials, finely);
-        judge.add(trials.last().map(|trial| trial.fit.poses.clone()).into_iter().collect());
-        let kept = usize::from(judge.prefers_last(judged.place));
-        Ok(trials.into_iter().skip(kept).take(1).collect())
+        let mut trials = self.begin(&[Way::Textured], GAUSSIANS);
+        self.advance(&mut trials, (0, STEPS[1]), false)?;
+        self.judge(&mut trials, false);
+        let least = simple.iter().map(|trial| trial.losses[1]).fold(f64::INFINITY, f64::min);
+        Ok(trials.pop().filter(|trial| trial.losses[1] <= most * least))
     }
 
     /// True where views of all sides show how it turns from time to time, or it is lifted from where it stood, so that
@@ -326,14 +301,9 @@ impl<'a> Contest<'a> {
         Ok(Some(if gains { off } else { on }))
     }
 
-    /// The way along the path that the judge finds or, where it cannot tell, one that explains the pixels, and trials of
-    /// these beside the simple ones.
-    fn along_the_path(
-        &mut self,
-        simple: Vec<Trial<'a>>,
-        reliable: &[usize],
-    ) -> Result<(Vec<Trial<'a>>, (Way, RotationEvidence)), TrainError> {
-        self.find_texture(&simple, reliable);
+    /// All other ways along the path, beside the simple ones.
+    fn along_the_path(&mut self, simple: Vec<Trial<'a>>) -> Result<Vec<Trial<'a>>, TrainError> {
+        let mut trials = simple;
         if self.may_be_followed() {
             let mut known: Vec<usize> =
                 self.train.iter().map(|view| self.object.views[*view].time_index).collect();
@@ -342,37 +312,12 @@ impl<'a> Contest<'a> {
                 (self.paths.followed, self.paths.off) = (Some(fit.poses), fit.air);
             }
         }
-        let judge = self.judge_of(Way::Slide(0));
-        let mut trials = simple;
-        if let Some(mut judge) = judge {
-            let judged = self.judged(&mut judge, self.paths.ways())?;
-            if let Some(judged) = judged.filter(|judged| judged.is_observed) {
-                // One of several outlines is chosen with all pixels.
-                let finely = self.object.outlines > 1 && !is_round(self.object.outline);
-                trials.retain(|trial| trial.way != judged.way);
-                trials.extend(self.observed(&mut judge, judged, finely)?);
-                return Ok((trials, (judged.way, RotationEvidence::Observed)));
-            }
-        }
-        let trials = self.unobserved(trials)?;
-        let way = decide(&errors(&trials), self.object.outline);
-        Ok((trials, (way, RotationEvidence::Assumed)))
-    }
-
-    /// Trials of an object whose rotation the judge does not tell: of the turns that its texture suggests or else of all
-    /// ways along the path, those near the best with all pixels.
-    fn unobserved(&self, simple: Vec<Trial<'a>>) -> Result<Vec<Trial<'a>>, TrainError> {
-        let least = simple.iter().map(|trial| trial.losses[1]).fold(f64::INFINITY, f64::min);
-        if self.paths.textured.is_some() {
-            let mut trials = self.begin(&[Way::Textured], GAUSSIANS);
-            self.advance(&mut trials, (0, STEPS[1]), false)?;
-            self.judge(&mut trials, false);
-            if trials.first().is_some_and(|trial| trial.losses[1] <= TEXTURE_GAIN * least) {
-                return Ok(trials);
-            }
-        }
-        let mut trials = simple;
-        let mut more = self.begin(&self.paths.unobserved(self.object.place), GAUSSIANS);
+        let ways = if self.object.place > 0 && self.paths.followed.is_some() {
+            vec![Way::Followed]
+        } else {
+            self.paths.ways()
+        };
+        let mut more = self.begin(&ways, GAUSSIANS);
         self.advance(&mut more, (0, STEPS[0]), false)?;
         give_up_hopeless(&mut more, |way| matches!(way, Way::Followed | Way::Roll(_)));
         self.advance(&mut more, (STEPS[0], STEPS[1]), false)?;
@@ -408,15 +353,14 @@ impl<'a> Contest<'a> {
             let mut fit = self.object.fit(poses, shape, rng);
             (fit.turns, fit.rolls) = match way {
                 Way::Rest => (Turns::Given, None),
-                Way::Slide(_) | Way::Spin(_) | Way::Pausing(_) => (Turns::Upright, None),
+                Way::Slide(_) | Way::Spin(_) => (Turns::Upright, None),
                 Way::Roll(factor) => (Turns::Free, Some(self.paths.outline.height / factor)),
-                Way::Followed | Way::Scaled(_) | Way::Textured => (Turns::Free, None),
+                Way::Followed | Way::Textured => (Turns::Free, None),
             };
             if *way == Way::Followed {
                 fit.air.clone_from(&self.paths.off);
             }
-            fit.stays = matches!(way, Way::Rest)
-                || (!self.paths.shifts() && matches!(way, Way::Spin(_) | Way::Pausing(_)));
+            fit.stays = matches!(way, Way::Rest | Way::Spin(_));
             Some(Trial { way: *way, fit, losses: [0.0; 2] })
         };
         ways.par_iter().filter_map(begin).collect()
@@ -456,7 +400,7 @@ impl<'a> Contest<'a> {
     }
 
     /// Views that were left out, or all where none were.
-    fn judged_views(&self) -> &[usize] {
+    fn judged(&self) -> &[usize] {
         if self.left_out.is_empty() { &self.train } else { &self.left_out }
     }
 
@@ -472,7 +416,7 @@ impl<'a> Contest<'a> {
             if self.may_be_followed() && trial.way != Way::Rest {
                 self.settle(&mut trial.fit, level);
             }
-            trial.losses[1] = trial.fit.mean_loss(self.judged_views(), level);
+            trial.losses[1] = trial.fit.mean_loss(self.judged(), level);
         });
     }
 }
@@ -500,21 +444,6 @@ pub(super) fn split(views: &[ObjectView], reliable: &[usize], good: &[usize]) ->
     reliable.iter().partition(|view| !is_left_out(views[**view].time_index))
 }
 
-/// Error of a way that was tried, on the views that were left out.
-fn error_of(trials: &[Trial<'_>], way: Way) -> Option<f64> {
-    trials.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1])
-}
-
-/// True where the error of resting is at most `gain` times that of a way of moving.
-fn rests(trials: &[Trial<'_>], way: Way, gain: f64) -> bool {
-    error_of(trials, Way::Rest).zip(error_of(trials, way)).is_some_and(|(rest, moves)| rest <= gain * moves)
-}
-
-/// Ways that were tried with their errors on the views that were left out.
-fn errors(trials: &[Trial<'_>]) -> Vec<(Way, f64)> {
-    trials.iter().map(|trial| (trial.way, trial.losses[1])).collect()
-}
-
 /// Ways that are near the best: paths, rolls, and what following found.
 fn rivals(trials: &[Trial<'_>]) -> Vec<Way> {
     let mut best = errors(trials);
@@ -536,25 +465,49 @@ fn rivals(trials: &[Trial<'_>]) -> Vec<Way> {
     rivals
 }
 
-/// The way of moving that is assumed where the judge cannot tell the rotation, by the errors of those that were tried.
-fn decide(tried: &[(Way, f64)], outline: &Outline) -> Way {
+/// Error of a way that was tried, on the views that were left out.
+fn error_of(trials: &[Trial<'_>], way: Way) -> Option<f64> {
+    trials.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1])
+}
+
+/// True of ways whose pictures tell that it turns, if not how far: the smallest turn in place explains less.
+fn turns(error_of: impl Fn(Way) -> Option<f64>, way: Way) -> bool {
+    let Way::Spin(degrees) = way else { return true };
+    let smallest = Way::Spin(SMALLEST_SPIN * degrees.signum());
+    // What was given up explains less.
+    let least = error_of(smallest).filter(|_| smallest != way);
+    least.zip(error_of(way)).is_none_or(|(least, error)| least > SPIN_GAIN * error)
+}
+
+/// True where the error of resting is at most `gain` times that of a way of moving.
+fn rests(trials: &[Trial<'_>], way: Way, gain: f64) -> bool {
+    error_of(trials, Way::Rest).zip(error_of(trials, way)).is_some_and(|(rest, moves)| rest <= gain * moves)
+}
+
+/// Ways that were tried with their errors on the views that were left out.
+fn errors(trials: &[Trial<'_>]) -> Vec<(Way, f64)> {
+    trials.iter().map(|trial| (trial.way, trial.losses[1])).collect()
+}
+
+/// The best way of moving, by the errors of those that were tried, and whether the pictures tell its turns.
+fn decide(tried: &[(Way, f64)], outline: &Outline) -> Option<(Way, RotationEvidence)> {
     let (is_round, in_contact) = (is_round(outline), outline.air.is_empty());
     let best = |wanted: &dyn Fn(&Way) -> bool| {
         tried.iter().filter(|(way, _)| wanted(way)).min_by(|a, b| a.1.total_cmp(&b.1)).copied()
     };
-    let Some((moving, moving_error)) = best(&|way| *way != Way::Rest) else { return Way::Slide(0) };
+    let (moving, moving_error) = best(&|way| *way != Way::Rest)?;
     let roll = best(&|way| matches!(way, Way::Roll(_)));
     let Some((turning, turning_error)) = best(&|way| way.degrees().is_some()) else {
-        return moving;
+        return Some((moving, RotationEvidence::Observed));
     };
     let others = roll.map_or(turning_error, |(_, error)| error.min(turning_error));
     if moving == Way::Followed && moving_error < FOLLOW_GAIN[usize::from(is_round)] * others {
-        return moving;
+        return Some((moving, RotationEvidence::Observed));
     }
     if let Some((way, error)) = roll
         && error <= ROLL_GAIN[usize::from(is_round)] * turning_error
     {
-        return way;
+        return Some((way, RotationEvidence::Observed));
     }
     let turns_far = turning.degrees().is_some_and(|degrees| degrees.abs() >= RIVAL.1);
     if let Some((way, error)) = roll
@@ -562,7 +515,7 @@ fn decide(tried: &[(Way, f64)], outline: &Outline) -> Way {
         && turns_far
         && error <= ROLLS_RATHER * turning_error
     {
-        return way;
+        return Some((way, RotationEvidence::Assumed));
     }
     let apart = |other: i32| {
         let difference = (other - turning.degrees().unwrap_or(0)).rem_euclid(360);
@@ -576,19 +529,19 @@ fn decide(tried: &[(Way, f64)], outline: &Outline) -> Way {
     let is_untried = is_round && tried.iter().filter(|(way, _)| way.degrees().is_some()).count() < 2;
     if is_untried || rival.is_some_and(|(_, error)| error < least) {
         if is_round && in_contact && has(Way::Roll(1.0)) {
-            return Way::Roll(1.0);
+            return Some((Way::Roll(1.0), RotationEvidence::Assumed));
         }
         // What may roll without a change of its outline is made to.
         let rolls_as_well = |(_, error): &(Way, f64)| *error <= ROLLS_AS_WELL * turning_error;
         if let Some((way, _)) = roll.filter(|roll| in_contact && rolls_as_well(roll)) {
-            return way;
+            return Some((way, RotationEvidence::Assumed));
         }
         if has(Way::Slide(0)) {
-            return Way::Slide(0);
+            return Some((Way::Slide(0), RotationEvidence::Assumed));
         }
-        return turning;
+        return Some((turning, RotationEvidence::Assumed));
     }
-    turning
+    Some((turning, RotationEvidence::Observed))
 }
 
 #[cfg(test)]
@@ -605,22 +558,34 @@ mod tests {
         let slides = [(Way::Slide(0), 0.1), (Way::Slide(90), 0.101)];
         let with = |more: &[(Way, f64)]| [&slides[..], more].concat();
         let (edgy, round) = (outline(0.7, Vec::new()), outline(1.0, vec![3]));
-
+        let assumed = |way: Way| Some((way, RotationEvidence::Assumed));
         // What may roll does, where it explains as much as sliding, and touches its support.
-        assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.101)]), &edgy), Way::Roll(0.8));
-        assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.102)]), &edgy), Way::Slide(0));
-        assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.099)]), &outline(0.7, vec![3])), Way::Slide(0));
+        assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.101)]), &edgy), assumed(Way::Roll(0.8)));
+        assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.102)]), &edgy), assumed(Way::Slide(0)));
+        assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.099)]), &outline(0.7, vec![3])), assumed(Way::Slide(0)));
         // What would have to turn far while it slides rolls, even a little worse.
         let turning = [(Way::Slide(-120), 0.1), (Way::Roll(1.08), 0.102)];
-        assert_eq!(decide(&turning, &edgy), Way::Roll(1.08));
-
-        assert_eq!(decide(&[(Way::Slide(-30), 0.1), turning[1]], &edgy), Way::Slide(-30));
-        assert_eq!(decide(&[turning[0], (Way::Roll(1.08), 0.104)], &edgy), Way::Slide(-120));
+        assert_eq!(decide(&turning, &edgy), assumed(Way::Roll(1.08)));
+        let observed = |way: Way| Some((way, RotationEvidence::Observed));
+        assert_eq!(decide(&[(Way::Slide(-30), 0.1), turning[1]], &edgy), observed(Way::Slide(-30)));
+        assert_eq!(decide(&[turning[0], (Way::Roll(1.08), 0.104)], &edgy), observed(Way::Slide(-120)));
         // Of a ball in the air no turn was tried but those that following found.
-        assert_eq!(decide(&[slides[0], (Way::Followed, 0.2)], &round), Way::Slide(0));
-        let followed = Way::Followed;
+        assert_eq!(decide(&[slides[0], (Way::Followed, 0.2)], &round), assumed(Way::Slide(0)));
+        let followed = Some((Way::Followed, RotationEvidence::Observed));
         assert_eq!(decide(&[slides[0], (Way::Followed, 0.05)], &round), followed);
-        assert_eq!(decide(&[slides[0], (Way::Followed, 0.09)], &round), Way::Slide(0));
-        assert_eq!(decide(&[slides[0], (Way::Followed, 0.2)], &edgy), Way::Slide(0));
+        assert_eq!(decide(&[slides[0], (Way::Followed, 0.09)], &round), assumed(Way::Slide(0)));
+        assert_eq!(decide(&[slides[0], (Way::Followed, 0.2)], &edgy), observed(Way::Slide(0)));
+    }
+
+    #[test]
+    fn what_any_turn_in_place_explains_does_not_turn() {
+        let with = |smallest: Option<f64>| {
+            move |way: Way| if way == Way::Spin(SMALLEST_SPIN) { smallest } else { Some(0.04) }
+        };
+        assert!(!turns(with(Some(0.042)), Way::Spin(160)));
+        assert!(turns(with(Some(0.05)), Way::Spin(160)));
+        assert!(turns(with(None), Way::Spin(160)), "given up");
+        assert!(turns(with(Some(0.042)), Way::Spin(SMALLEST_SPIN)));
+        assert!(turns(with(Some(0.042)), Way::Slide(0)));
     }
 }

@@ -8,44 +8,31 @@ use cif_geometry::scalar::direct_sigmoid;
 use glam::{DQuat, DVec3};
 use nalgebra::{Matrix3, Vector3};
 
-use super::fit::log;
 use super::outline::Outline;
 use super::shape::Pose;
+use super::view::{ObjectView, median};
 
-/// Turns about the normal, degrees apart: the truth lies within the 30 degrees up to which the judge takes turns as the
-/// same.
-const SLIDE: i32 = 45;
+/// Turns of slides, degrees apart.
+const SLIDE: i32 = 30;
 
-/// Largest turn in place, degrees: it may turn on, but then the texture comes around again.
-const SPINS_TO: i32 = 360;
+/// Turns in place, degrees, and the smallest of them.
+const SPINS: [i32; 12] = [-240, -200, -160, -120, -80, -40, 40, 80, 120, 160, 200, 240];
+pub(super) const SMALLEST_SPIN: i32 = 40;
 
-/// Amounts of rolling, of that without slip about the height, between which a radius is looked for: the height tells that
-/// of balls well and that of other things, which roll about another axis than their middle, by half.
-const ROLLS: (f64, f64) = (0.75, 1.6);
+/// Rolling radii tried of balls, of the height.
+const ROLLS: [f64; 9] = [0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08];
 
-/// The same of fits where the judge does not tell, and rolling radii tried then, of the height: of balls, and of other
-/// things, whose height tells it less well.
-const ASSUMED: i32 = 30;
-const ASSUMED_ROLLS: [f64; 9] = [0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08];
+/// Rolling radii tried of other things, whose height tells it less well.
 const OTHER_ROLLS: [f64; 12] = [0.64, 0.68, 0.72, 0.76, 0.8, 0.84, 0.88, 0.92, 0.96, 1.0, 1.04, 1.08];
-
-/// Difference of the whole turns of courses that are tried, degrees: the judge takes turns within 30 degrees as the same.
-const GRID: f64 = 30.0;
-
-/// Most amounts of rolling that are tried.
-const MOST_ROLLS: usize = 48;
-
-/// Turns, of those that following found, that these are held against: following drifts.
-const SCALES: [f64; 4] = [0.5, 0.75, 1.25, 1.5];
-
-/// Difference of courses that are added on either side of the best, degrees.
-const FINER: [f64; 2] = [10.0, 20.0];
 
 /// Length of a bar in its widths, and the cosine between its long axis and the normal up to which it lies.
 const BAR: (f64, f64) = (2.0, 0.3);
 
 /// Roundness of masks from which an object may roll as a ball.
 const ROUND: f64 = 0.93;
+
+/// Pixels of a mask from which its texture may show a turn.
+const TEXTURED: f64 = 400.0;
 
 /// Height of the centre, in radii, up to which an object may roll: what is taller stands.
 const ROLLS_UP_TO: f64 = 2.0;
@@ -63,14 +50,10 @@ pub(super) enum Way {
     Slide(i32),
     /// In place, turning about the normal at a constant rate, degrees in all.
     Spin(i32),
-    /// The same with the pauses that are seen.
-    Pausing(i32),
     /// Along the path without slip, with this radius of the height.
     Roll(f64),
     /// As following it from time to time found.
     Followed,
-    /// The same with turns of so many of those that following found.
-    Scaled(f64),
     /// Along the path, turning about the normal, or its own long axis, as its texture tells.
     Textured,
 }
@@ -82,10 +65,8 @@ impl Way {
             Self::Rest => "rests".to_owned(),
             Self::Slide(degrees) => format!("slides, turning {degrees} deg"),
             Self::Spin(degrees) => format!("turns {degrees} deg in place"),
-            Self::Pausing(degrees) => format!("turns {degrees} deg in place, with pauses"),
             Self::Roll(factor) => format!("rolls with {factor:.2} of its height"),
             Self::Followed => "followed from time to time".to_owned(),
-            Self::Scaled(share) => format!("followed from time to time, turning {share:.2} as far"),
             Self::Textured => "turns as its texture tells".to_owned(),
         }
     }
@@ -93,7 +74,7 @@ impl Way {
     /// Turn about the normal, degrees, of ways that are told apart by it.
     pub(super) fn degrees(self) -> Option<i32> {
         match self {
-            Self::Slide(degrees) | Self::Spin(degrees) | Self::Pausing(degrees) => Some(degrees),
+            Self::Slide(degrees) | Self::Spin(degrees) => Some(degrees),
             _ => None,
         }
     }
@@ -116,8 +97,6 @@ pub(super) struct Paths<'a> {
     pub(super) followed: Option<BTreeMap<usize, Pose>>,
     /// Times at which it may be off its support in these.
     pub(super) off: Vec<usize>,
-    /// Share of all turning in place that is done by each time, where pauses are seen.
-    pub(super) pauses: Option<BTreeMap<usize, f64>>,
     /// Poses with turns that its texture tells, where it does.
     pub(super) textured: Option<BTreeMap<usize, Pose>>,
 }
@@ -139,73 +118,16 @@ impl Paths<'_> {
         self.reach() >= SHIFTS * self.outline.size()
     }
 
-    /// True where an object on the path may roll: what its rays show off the support flies, and what is tall stands.
-    pub(super) fn may_roll(&self) -> bool {
+    /// Ways of moving along the path worth a trial, beside sliding without a turn.
+    pub(super) fn ways(&self) -> Vec<Way> {
+        let mut ways = Vec::new();
+        ways.extend((-180 / SLIDE..=180 / SLIDE).filter(|k| *k != 0).map(|k| Way::Slide(k * SLIDE)));
+        // What its rays show off the support flies.
         let flies = self.outline.is_surrounded && !self.outline.air.is_empty();
         let is_low = self.outline.height <= ROLLS_UP_TO * self.outline.radius;
-        self.stands && !flies && is_low && self.reach() >= ROLLS_FROM * self.outline.size()
-    }
-
-    /// Ways of moving along the path; the first does not turn.
-    pub(super) fn ways(&self) -> Vec<Way> {
-        let slides = (-180 / SLIDE..=180 / SLIDE).filter(|k| *k != 0).map(|k| Way::Slide(k * SLIDE));
-        let mut ways: Vec<Way> = std::iter::once(Way::Slide(0)).chain(slides).collect();
-        if self.may_roll() {
-            ways.extend(self.amounts().into_iter().map(Way::Roll));
-        } else {
-            ways.extend(self.spins().into_iter().skip(1));
-        }
-        if self.followed.is_some() {
-            ways.push(Way::Followed);
-            ways.extend(SCALES.map(Way::Scaled));
-        }
-        if self.textured.is_some() {
-            ways.push(Way::Textured);
-        }
-        ways
-    }
-
-    /// Rolling radii that are tried, of the height: equally far apart in the whole turn.
-    fn amounts(&self) -> Vec<f64> {
-        let whole = self.rolled_degrees();
-        let count = ((ROLLS.1 - ROLLS.0) * whole / GRID).ceil().clamp(4.0, MOST_ROLLS as f64);
-        let amount = |k: usize| ROLLS.0 + (ROLLS.1 - ROLLS.0) * k as f64 / count;
-        (0..=count as usize).map(|k| 1.0 / amount(k)).collect()
-    }
-
-    /// Turn of rolling without slip about the height, degrees.
-    fn rolled_degrees(&self) -> f64 {
-        let places: Vec<DVec3> = self.along.values().copied().collect();
-        let length: f64 = places.windows(2).map(|pair| (pair[1] - pair[0]).length()).sum();
-        (length / self.outline.height.max(1e-9)).to_degrees()
-    }
-
-    /// Ways beside one.
-    pub(super) fn beside(&self, way: Way) -> Vec<Way> {
-        let around = FINER.iter().flat_map(|degrees| [-degrees, *degrees]);
-        let whole = |more: f64| more.round() as i32;
-        match way {
-            Way::Slide(turn) => around.map(|more| Way::Slide(turn + whole(more))).collect(),
-            Way::Spin(turn) => around.map(|more| Way::Spin(turn + whole(more))).collect(),
-            Way::Pausing(turn) => around.map(|more| Way::Pausing(turn + whole(more))).collect(),
-            Way::Roll(factor) => {
-                let of = |more: f64| Way::Roll(1.0 / (1.0 / factor + more / self.rolled_degrees().max(GRID)));
-                around.map(of).collect()
-            }
-            Way::Rest | Way::Followed | Way::Scaled(_) | Way::Textured => Vec::new(),
-        }
-    }
-
-    /// Ways to try where the judge cannot tell; of an outline at a place beside the first what following found alone.
-    pub(super) fn unobserved(&self, place: usize) -> Vec<Way> {
-        let mut ways = Vec::new();
-        if place == 0 || self.followed.is_none() {
-            let turns = (-180 / ASSUMED..=180 / ASSUMED).filter(|k| *k != 0);
-            ways.extend(turns.map(|k| Way::Slide(k * ASSUMED)));
-            if self.may_roll() {
-                let radii: &[f64] = if is_round(self.outline) { &ASSUMED_ROLLS } else { &OTHER_ROLLS };
-                ways.extend(radii.iter().map(|radius| Way::Roll(*radius)));
-            }
+        if self.stands && !flies && is_low && self.reach() >= ROLLS_FROM * self.outline.size() {
+            let radii: &[f64] = if is_round(self.outline) { &ROLLS } else { &OTHER_ROLLS };
+            ways.extend(radii.iter().map(|radius| Way::Roll(*radius)));
         }
         if self.followed.is_some() {
             ways.push(Way::Followed);
@@ -221,12 +143,15 @@ impl Paths<'_> {
         rolls.map(rotations).collect()
     }
 
-    /// Resting, and ways of turning in place.
+    /// True where an object may turn in place without a change of its outline, and texture would show it.
+    pub(super) fn may_turn_unseen(&self, views: &[ObjectView]) -> bool {
+        let mut areas: Vec<f64> = views.iter().map(ObjectView::area).collect();
+        is_round(self.outline) && median(&mut areas) >= TEXTURED
+    }
+
+    /// Ways of turning in place, and resting.
     pub(super) fn spins(&self) -> Vec<Way> {
-        let count = SPINS_TO / SLIDE;
-        let turns = || (-count..=count).filter(|k| *k != 0).map(|k| k * SLIDE);
-        let pausing = turns().filter(|_| self.pauses.is_some()).map(Way::Pausing);
-        std::iter::once(Way::Rest).chain(turns().map(Way::Spin)).chain(pausing).collect()
+        std::iter::once(Way::Rest).chain(SPINS.map(Way::Spin)).collect()
     }
 
     /// Poses along the path with turns, from none at the reference; between times that have one it turns evenly.
@@ -247,22 +172,6 @@ impl Paths<'_> {
             (*time, Pose { rotation: turn(*time) * back, translation: *place })
         };
         self.along.iter().map(pose).collect()
-    }
-
-    /// Poses that following found, with a share of the turn from each time to the next.
-    fn scaled(&self, share: f64) -> BTreeMap<usize, Pose> {
-        let found = self.poses(Way::Followed);
-        let mut last: Option<(DQuat, DQuat)> = None;
-        let mut poses = BTreeMap::new();
-        for (time, pose) in &found {
-            let rotation = last.map_or(pose.rotation, |(before, scaled)| {
-                let turn = log(pose.rotation * before.inverse());
-                (DQuat::from_scaled_axis(share * turn) * scaled).normalize()
-            });
-            last = Some((pose.rotation, rotation));
-            poses.insert(*time, Pose { rotation, ..*pose });
-        }
-        poses
     }
 
     /// Poses of a way at the times of the path.
@@ -290,19 +199,11 @@ impl Paths<'_> {
                 let steps: Vec<f64> = times.iter().map(|time| *time as f64).collect();
                 turned(&steps, degrees)
             }
-            Way::Pausing(degrees) => {
-                let share = |time: &usize| {
-                    let shares = self.pauses.iter().flat_map(|shares| shares.range(..=time)).next_back();
-                    shares.map_or(0.0, |(_, share)| *share)
-                };
-                turned(&times.iter().map(share).collect::<Vec<f64>>(), degrees)
-            }
             Way::Roll(factor) => {
                 let rotations = rolled(&places, self.up, self.outline.height / factor);
                 let back = rotations[origin].inverse();
                 rotations.into_iter().map(|rotation| rotation * back).collect()
             }
-            Way::Scaled(share) => return self.scaled(share),
             Way::Followed | Way::Textured => {
                 let found = if way == Way::Followed { &self.followed } else { &self.textured };
                 return found
@@ -313,8 +214,8 @@ impl Paths<'_> {
                     .collect();
             }
         };
-        let stays = !self.shifts() && matches!(way, Way::Rest | Way::Spin(_) | Way::Pausing(_));
-        let place = |k: usize| if stays || way == Way::Rest { self.place } else { places[k] };
+        let stays = matches!(way, Way::Rest | Way::Spin(_));
+        let place = |k: usize| if stays { self.place } else { places[k] };
         let pose = |(k, rotation)| (times[k], Pose { rotation, translation: place(k) });
         rotations.into_iter().enumerate().map(pose).collect()
     }
@@ -411,7 +312,6 @@ mod tests {
                 reference: 0,
                 followed: None,
                 off: Vec::new(),
-                pauses: None,
                 textured: None,
             };
             paths.ways().iter().any(|way| matches!(way, Way::Roll(_)))

@@ -22,6 +22,7 @@ fn told(gaussians: Gaussians) -> Fitted {
         gaussians,
         reference: (DQuat::IDENTITY, DVec3::ZERO),
         rotation: RotationEvidence::Observed,
+        is_turned: true,
         error: 0.0,
         unturned: None,
         bent: None,
@@ -35,6 +36,7 @@ fn told(gaussians: Gaussians) -> Fitted {
 fn poses_are_kept_of_balls_with_rough_masks_and_of_what_turns() {
     let fitted = |(error, unturned), rotation, is_ball| Fitted {
         rotation,
+        is_turned: rotation == RotationEvidence::Observed,
         error,
         unturned: Some(unturned),
         is_ball,

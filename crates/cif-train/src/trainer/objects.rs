@@ -64,8 +64,7 @@ pub(super) fn is_rigid(fitted: &Fitted, most: f64) -> bool {
         (false, true) => MOST_SETTLED,
         (false, false) => most,
     };
-    let turns = fitted.rotation == RotationEvidence::Observed;
-    let explains = |unturned: f64| turns && fitted.error <= TURN_EXPLAINS * unturned;
+    let explains = |unturned: f64| fitted.is_turned && fitted.error <= TURN_EXPLAINS * unturned;
     let bends_no_better = |bent: f64| bent >= BENDS_NO_BETTER && fitted.error <= ROUGH * most;
     let deforms = !fitted.is_ball && fitted.bent.is_some_and(|bent| bent <= DEFORMS);
     let is_explained = fitted.error <= most

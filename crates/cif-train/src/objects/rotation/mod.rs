@@ -1,4 +1,4 @@
-//! How objects move, by evidence. Source: motion reference, second part.
+//! Which rotation of an object its pictures show, and whether they do. Source: motion reference, second part.
 //!
 //! | file | answers |
 //! |---|---|
@@ -7,7 +7,6 @@
 //! | `judge` | which rotation they show, and whether they do |
 //! | `layered`, `shaded` | how well paint and light explain pixels left out |
 //! | `folds`, `compare` | which pixels are left out, and by how many standard errors one hypothesis is better |
-//! | `pauses` | when what turns in place turns |
 
 mod compare;
 mod evidence;
@@ -15,11 +14,9 @@ mod folds;
 mod hull;
 mod judge;
 mod layered;
-mod pauses;
 mod shaded;
 #[cfg(test)]
 mod tests;
 
-#[cfg(test)]
-pub(crate) use self::judge::Course;
-pub(crate) use self::judge::Judge;
+pub(super) use self::hull::Course;
+pub(super) use self::judge::Judge;

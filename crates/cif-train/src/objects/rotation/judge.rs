@@ -13,18 +13,15 @@
 //! (0.01 is one percent of brightness). Only the layered model tells a turn; that there is none, the
 //! shaded one tells too.
 
-use std::collections::BTreeMap;
-
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
+use super::super::view::ObjectView;
 use super::compare::compared;
 use super::evidence::{Evidence, Look};
-use super::hull::{Grid, Hit, Hull};
+use super::hull::{Course, Grid, Hit, Hull};
 use super::layered::layered;
-use super::pauses;
 use super::shaded::shaded;
-use crate::objects::{ObjectView, Pose};
 
 /// Standard errors by which a hypothesis must beat another to be told from it.
 const SIGMAS: f64 = 2.0;
@@ -51,20 +48,17 @@ const REACH: f64 = 1.3;
 /// Volume of a hull, of the largest, below which a hypothesis contradicts the outlines.
 const LEAST_VOLUME: f64 = 1.0 / 3.0;
 
-/// A hypothesis: world from object by time.
-pub(crate) type Course = BTreeMap<usize, Pose>;
-
 /// Finding of the judge.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Verdict {
+pub(super) struct Verdict {
     /// Place of the best hypothesis.
-    pub(crate) best: usize,
+    pub(in super::super) best: usize,
     /// Standard errors by which it beats the nearest rival that differs by more than 30 degrees.
-    pub(crate) margin: f64,
+    pub(in super::super) margin: f64,
     /// True where it beats every such rival by two standard errors: the rotation is observed.
-    pub(crate) is_observed: bool,
+    pub(in super::super) is_observed: bool,
     /// True where it differs from no turn by more than 30 degrees.
-    pub(crate) turns: bool,
+    pub(in super::super) turns: bool,
 }
 
 /// Residuals of one hypothesis by pixel; NaN where it predicts nothing.
@@ -76,15 +70,13 @@ struct Residuals {
 }
 
 /// Hypotheses about one object, and how well each explains its pixels.
-pub(crate) struct Judge<'a> {
+pub(in super::super) struct Judge<'a> {
     evidence: Evidence<'a>,
     /// Size of the object and edge of a voxel, metres.
     size: f64,
     voxel: f64,
     /// Cells of the layer of light by pixel, and their number.
     light: (Vec<Option<u32>>, usize),
-    /// What pixels see of the hull without turns.
-    unturned: Vec<Option<Hit>>,
     courses: Vec<Course>,
     residuals: Vec<Residuals>,
 }
@@ -92,7 +84,7 @@ pub(crate) struct Judge<'a> {
 impl<'a> Judge<'a> {
     /// A judge of an object of this size (the larger of half height and radius, metres) with a first hypothesis, under
     /// which it does not turn; `None` where the views are too few.
-    pub(crate) fn new(views: &'a [ObjectView], size: f64, unturned: Course) -> Option<Self> {
+    pub(in super::super) fn new(views: &'a [ObjectView], size: f64, unturned: Course) -> Option<Self> {
         let evidence = Evidence::of(views)?;
         let footprint = |look: &Look<'_>| {
             let pose = unturned.get(&look.view.time_index)?;
@@ -106,20 +98,18 @@ impl<'a> Judge<'a> {
             size,
             voxel,
             light: (Vec::new(), 0),
-            unturned: Vec::new(),
             courses: Vec::new(),
             residuals: Vec::new(),
         };
         let (hull, hits) = judge.seen(&unturned);
         judge.light = light_cells(&judge.evidence, &hull, &hits);
         judge.residuals.push(judge.residuals_of(&unturned, (&hull, &hits), false));
-        judge.unturned = hits;
         judge.courses.push(unturned);
         Some(judge)
     }
 
     /// Adds hypotheses.
-    pub(crate) fn add(&mut self, courses: Vec<Course>) {
+    pub(in super::super) fn add(&mut self, courses: Vec<Course>) {
         let of = |course: &Course| {
             let (hull, hits) = self.seen(course);
             self.residuals_of(course, (&hull, &hits), true)
@@ -129,20 +119,16 @@ impl<'a> Judge<'a> {
         self.courses.extend(courses);
     }
 
-    /// Share of all turning in place that is done by each time; `None` where no pauses are seen.
-    pub(crate) fn pauses(&self) -> Option<BTreeMap<usize, f64>> {
-        pauses::shares(&self.evidence, &self.unturned)
-    }
-
-    /// True where the last hypothesis explains more than another.
-    pub(crate) fn prefers_last(&self, other: usize) -> bool {
-        let last = self.residuals.len() - 1;
-        let fields: Vec<&[f32]> = [last, other].map(|k| &self.residuals[k].layered[..]).to_vec();
-        compared(&self.evidence, &fields)[0][1] > 0.0
+    /// True where a hypothesis is observed: it, or one within 30 degrees of it, beats all others.
+    pub(in super::super) fn tells(&self, place: usize) -> bool {
+        let times: Vec<usize> = self.evidence.looks.iter().map(|look| look.view.time_index).collect();
+        self.verdict().is_some_and(|found| {
+            found.is_observed && angles(&self.courses, &times)[found.best][place] <= APART
+        })
     }
 
     /// The finding about the hypotheses so far; `None` where none can be compared with another.
-    pub(crate) fn verdict(&self) -> Option<Verdict> {
+    pub(super) fn verdict(&self) -> Option<Verdict> {
         let times: Vec<usize> = self.evidence.looks.iter().map(|look| look.view.time_index).collect();
         let angles = angles(&self.courses, &times);
         let largest = self.residuals.iter().map(|residuals| residuals.volume).fold(0.0, f64::max);

@@ -4,10 +4,10 @@ use std::f64::consts::PI;
 
 use glam::{DQuat, DVec3};
 
+use super::super::shape::Pose;
+use super::super::testing::{Cameras, TIMES, jumping, moving, patches, rig, solid, sphere_places, views};
 use super::judge::Verdict;
 use super::{Course, Judge};
-use crate::objects::Pose;
-use crate::objects::testing::{Cameras, TIMES, jumping, moving, patches, rig, solid, sphere_places, views};
 
 const RADIUS: f64 = 0.06;
 

@@ -5,8 +5,7 @@ use nalgebra::{SMatrix, SVector};
 
 use super::evidence::Evidence;
 use super::folds::{FEWEST, FOLDS, OBSERVED, folds, numbered};
-use super::hull::Hit;
-use super::judge::Course;
+use super::hull::{Course, Hit};
 
 /// Spherical harmonics of degrees 1 and 2 of a unit normal, up to constant factors.
 fn harmonics(n: DVec3) -> SVector<f64, 8> {

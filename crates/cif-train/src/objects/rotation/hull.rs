@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 
 use glam::DVec3;
 
-use crate::objects::{ObjectView, Pose, Seen};
+use super::super::shape::Pose;
+use super::super::view::{ObjectView, Seen};
 
 /// Share of the views that see a voxel which may show it outside the mask: masks are a pixel off here and there.
 const OUTSIDE: f64 = 0.12;
@@ -24,6 +25,9 @@ const KERNEL: [f32; 4] = [0.399_05, 0.242_04, 0.054_01, 0.004_43];
 
 /// Most views that carve: more do not change the hull.
 const CARVING: usize = 48;
+
+/// A hypothesis: world from object by time.
+pub(in super::super) type Course = BTreeMap<usize, Pose>;
 
 /// A regular grid of voxels.
 #[derive(Clone, Copy, Debug)]
@@ -88,7 +92,7 @@ pub(super) struct Hit {
 
 impl Hull {
     /// Carves a grid by the masks of views whose times have poses; pixels of what may hide the object say nothing.
-    pub(super) fn carved(grid: Grid, views: &[&ObjectView], poses: &BTreeMap<usize, Pose>) -> Self {
+    pub(super) fn carved(grid: Grid, views: &[&ObjectView], poses: &Course) -> Self {
         let posed: Vec<(&ObjectView, &Pose)> =
             views.iter().filter_map(|view| Some((*view, poses.get(&view.time_index)?))).collect();
         let looked: Vec<&(&ObjectView, &Pose)> =

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use glam::{DVec2, DVec3};
 
-use crate::objects::ObjectView;
+use super::super::view::ObjectView;
 
 /// Added to colours before their logarithm is taken: the noise of dark pixels.
 const DARK: f64 = 0.03;
