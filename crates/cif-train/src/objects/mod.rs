@@ -6,7 +6,7 @@
 //! | `order` | what cannot hide an object |
 //! | `view` | what a frame shows of an object |
 //! | `plane`, `below` | which plane objects stand on, and which points may lie on it |
-//! | `outline`, `height`, `path` | how large an object is, how high its middle is, and where it goes |
+//! | `outline`, `path` | how large an object is, and where it goes |
 //! | `shape` | its Gaussians alone, against crops |
 //! | `fit` | its poses and Gaussians, moved together |
 //! | `priors` | how it moves where pictures say little |
@@ -28,7 +28,6 @@ mod bend;
 mod fit;
 mod follow;
 mod grow;
-mod height;
 mod known;
 mod mend;
 mod order;

@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 
 use glam::{DMat2, DVec2, DVec3};
 
-use super::height::height_of_path;
 use super::path;
 use super::plane::Plane;
 use super::view::{ObjectView, WITHIN, are_discs, is_one_camera, median, rests};
@@ -161,7 +160,7 @@ enum Stance {
 /// lower fell over: pictures decide. Where it sees the object from other sides soon after, rays that cross tell the path
 /// of what leaves the plane. `times` are those of the sequence.
 pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize) -> Vec<Outline> {
-    let on_plane = |stance: Stance| plane.and_then(|plane| on_plane(views, (plane, times), stance));
+    let on_plane = |stance: Stance| plane.and_then(|plane| on_plane(views, plane, stance));
     let met = meetings(views);
     if !met.is_empty() {
         let on_plane = on_plane(Stance::MayLeave);
@@ -301,7 +300,7 @@ fn meetings(views: &[ObjectView]) -> BTreeMap<usize, DVec3> {
 
 /// Outline of the views of an object on a plane; `None` where no mask is seen from above, or nothing tells that it moves
 /// in this way.
-fn on_plane(views: &[ObjectView], (plane, times): (&Plane, usize), stance: Stance) -> Option<Outline> {
+fn on_plane(views: &[ObjectView], plane: &Plane, stance: Stance) -> Option<Outline> {
     let is_whole = |view: &&ObjectView| view.is_whole() || (!view.cut && view.visible >= FULLY_SEEN);
     let whole: Vec<&ObjectView> = match views.iter().filter(is_whole).collect::<Vec<_>>() {
         whole if !whole.is_empty() => whole,
@@ -339,8 +338,6 @@ fn on_plane(views: &[ObjectView], (plane, times): (&Plane, usize), stance: Stanc
     if stance == Stance::Topples {
         heights = steady_heights(views, plane, medians.height)?;
         medians.height = heights.iter().copied().fold(0.0, f64::max);
-    } else if !leaves && is_one_camera(views) {
-        heights.fill(height_of_path(medians.height, &whole, plane, times));
     }
     let mut sums: BTreeMap<usize, (DVec3, f64, bool)> = BTreeMap::new();
     for ((view, size), height) in views.iter().zip(steady_sizes(views, plane, medians.height)).zip(heights) {
@@ -559,7 +556,7 @@ mod tests {
         let mut views = views(solid(&sphere_places(RADIUS), |_| [0.8, 0.5, 0.2], 0.006), &truth, moving);
         views.iter_mut().filter(|view| view.time_index < 12).for_each(|view| view.touched = 0.3);
         let error = |views: &[ObjectView]| {
-            let found = on_plane(views, (&FLOOR, TIMES), Stance::MayLeave).unwrap();
+            let found = on_plane(views, &FLOOR, Stance::MayLeave).unwrap();
             let errors = found.path.iter().map(|(time, centre)| (*centre - place(*time)).length());
             errors.fold(0.0, f64::max)
         };
