@@ -875,9 +875,18 @@ fn shapes() -> impl Strategy<Value = Shape> {
 /// Strengths at and beside every threshold, and at both ends.
 fn strengths() -> impl Strategy<Value = f32> {
     prop::sample::select(vec![
-        0.0, 1e-30, 0.003_92,
-        // Just above 1/255: at it, rounding decides whether a Gaussian is drawn.
-        0.003_93, 0.02, 0.5, 0.989_9, 0.99, 0.990_1, 0.999_999, 1.0,
+        0.0,
+        1e-30,
+        0.003_92,
+        1.0 / 255.0,
+        0.003_93,
+        0.02,
+        0.5,
+        0.989_9,
+        0.99,
+        0.990_1,
+        0.999_999,
+        1.0,
     ])
 }
 

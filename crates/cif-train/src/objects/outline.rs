@@ -80,7 +80,7 @@ pub(super) struct Outline {
     pub(super) is_surrounded: bool,
     /// Times at which the rays of several cameras do not meet, though it stands: it rests, or does beside them.
     pub(super) held: Vec<usize>,
-    /// Those at which they do not, and nothing tells that it stands: its place is a guess.
+    /// Those at which they do not, and nothing shows that it stands: its place is a guess.
     pub(super) guessed: Vec<usize>,
     /// True of what is tried only where no other outline explains what is seen: a plane tells depths better than few
     /// rays.
@@ -248,7 +248,7 @@ fn stand(outline: &mut Outline, views: &[ObjectView], plane: &Plane, met: &BTree
     outline.held = held;
 }
 
-/// Puts an object about where the rays of masks meet that the border cuts, at times at which nothing else tells.
+/// Puts an object about where the rays of masks meet that the border cuts, at times at which nothing else shows it.
 fn guess(outline: &mut Outline, views: &[ObjectView], met: &BTreeMap<usize, DVec3>) {
     let is_known = |time: &usize| met.contains_key(time) || outline.held.contains(time);
     let weight = |view: &ObjectView| view.visible.powi(2) * if view.cut { path::CUT } else { 1.0 } + 1e-4;

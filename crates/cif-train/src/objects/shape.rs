@@ -60,9 +60,9 @@ impl Adam {
 
 /// A pose: world from object.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Pose {
-    pub(crate) rotation: DQuat,
-    pub(crate) translation: DVec3,
+pub(super) struct Pose {
+    pub(super) rotation: DQuat,
+    pub(super) translation: DVec3,
 }
 
 /// Gaussians of an object, with their optimiser and a renderer.

@@ -19,7 +19,7 @@ use super::order::Order;
 use super::outline::{Outline, meeting_point};
 use super::path::smooth;
 use super::plane::Plane;
-use super::rotation::Judge;
+use super::rotation::is_observed;
 use super::shape::{Pose, Shape};
 use super::trials::{self, GAUSSIANS, STEPS};
 use super::view::{ObjectView, is_one_camera, median};
@@ -72,7 +72,7 @@ pub(crate) struct Fitted {
     /// Pose at the time that shows most of it.
     pub(crate) reference: (DQuat, DVec3),
     pub(crate) rotation: RotationEvidence,
-    /// True where no other turn fits as well, whether or not the judge observes this one.
+    /// True where no other turn fits as well, whether or not this one is observed.
     pub(crate) is_turned: bool,
     /// Error on pixels that were left out.
     pub(crate) error: f64,
@@ -116,7 +116,7 @@ pub(super) struct Object<'a> {
     /// Place of the outline among those that the object may have: those beside the first suggest no ways of moving but
     /// what following finds.
     pub(super) place: usize,
-    /// Number of these outlines.
+    /// Number of these outlines: several are compared with all pixels.
     pub(super) outlines: usize,
     pub(super) surroundings: Surroundings<'a>,
 }
@@ -224,14 +224,13 @@ impl<'a> Object<'a> {
         is_told: bool,
         surroundings: Surroundings<'a>,
     ) -> Vec<Self> {
-        let count = outlines.len();
         let of = |(place, outline)| Object {
             label,
             views,
             outline,
             is_told,
             place,
-            outlines: count,
+            outlines: outlines.len(),
             surroundings,
         };
         outlines.iter().enumerate().map(of).collect()
@@ -369,7 +368,7 @@ impl<'a> Object<'a> {
         Ok(Some(Started { fit, path, way, rotation, is_turned, error, unturned, bent, reference }))
     }
 
-    /// True where the judge tells rotations that following found from none, and from turns about the upright axis.
+    /// True where the images show rotations that following found, and not turns about the upright axis instead.
     fn shows(&self, path: &BTreeMap<usize, DVec3>, poses: &BTreeMap<usize, Pose>) -> bool {
         let up = self.surroundings.plane.map_or(self.surroundings.up, |plane| plane.normal);
         let (Some(first), Some(last)) = (path.keys().next(), path.keys().next_back()) else { return false };
@@ -379,9 +378,7 @@ impl<'a> Object<'a> {
             let rotation = |time: usize| DQuat::from_axis_angle(up, angle(time).to_radians());
             path.iter().map(|(t, place)| (*t, Pose { rotation: rotation(*t), translation: *place })).collect()
         };
-        let Some(mut judge) = Judge::new(self.views, self.outline.size(), turning(0)) else { return false };
-        judge.add(std::iter::once(poses.clone()).chain(RIVALS.map(turning)).collect());
-        judge.tells(1)
+        is_observed((self.views, self.outline.size()), poses, turning(0), RIVALS.map(turning))
     }
 
     /// The place where views see it together.

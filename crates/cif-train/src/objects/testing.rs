@@ -21,29 +21,29 @@ use crate::mask_table::MaskTable;
 use crate::phases::Phases;
 use crate::random::{Purpose, stream};
 
-pub(crate) const TIMES: usize = 30;
-pub(crate) const FLOOR: Plane = Plane { normal: DVec3::Z, offset: 0.0 };
+pub(super) const TIMES: usize = 30;
+pub(super) const FLOOR: Plane = Plane { normal: DVec3::Z, offset: 0.0 };
 
 /// Cameras by time.
-pub(crate) type Cameras = fn(usize) -> Vec<PinholeCamera>;
+pub(super) type Cameras = fn(usize) -> Vec<PinholeCamera>;
 
 /// One camera, on an arc above the floor.
-pub(crate) fn moving(time: usize) -> Vec<PinholeCamera> {
+pub(super) fn moving(time: usize) -> Vec<PinholeCamera> {
     vec![camera(0.5 + 0.9 * time as f64 / TIMES as f64)]
 }
 
 /// Five cameras that stay in place.
-pub(crate) fn rig(_: usize) -> Vec<PinholeCamera> {
+pub(super) fn rig(_: usize) -> Vec<PinholeCamera> {
     [0.0, 1.2, 2.5, 3.7, 5.0].map(camera).to_vec()
 }
 
 /// One camera that looks from another side at every time.
-pub(crate) fn jumping(time: usize) -> Vec<PinholeCamera> {
+pub(super) fn jumping(time: usize) -> Vec<PinholeCamera> {
     vec![camera(2.4 * time as f64)]
 }
 
 /// A camera above the floor, which looks at its origin.
-pub(crate) fn camera(angle: f64) -> PinholeCamera {
+pub(super) fn camera(angle: f64) -> PinholeCamera {
     let centre = DVec3::new(1.1 * angle.sin(), -1.1 * angle.cos(), 0.8);
     let forward = (DVec3::new(0.0, 0.0, 0.05) - centre).normalize();
     let right = forward.cross(DVec3::Z).normalize();
@@ -58,7 +58,7 @@ pub(crate) fn camera(angle: f64) -> PinholeCamera {
 }
 
 /// Opaque Gaussians at places around the origin, in colours of these places.
-pub(crate) fn solid(places: &[DVec3], color: impl Fn(DVec3) -> [f32; 3], size: f32) -> Gaussians {
+pub(super) fn solid(places: &[DVec3], color: impl Fn(DVec3) -> [f32; 3], size: f32) -> Gaussians {
     let means: Vec<[f32; 3]> = places.iter().map(|p| p.to_array().map(|v| v as f32)).collect();
     let colors: Vec<[f32; 3]> = places.iter().map(|p| color(*p)).collect();
     let mut gaussians = Gaussians::from_points(&means, &colors).unwrap();
@@ -68,13 +68,13 @@ pub(crate) fn solid(places: &[DVec3], color: impl Fn(DVec3) -> [f32; 3], size: f
 }
 
 /// Views of a solid on its way.
-pub(crate) fn views(gaussians: Gaussians, poses: &[(DQuat, DVec3)], cameras: Cameras) -> Vec<ObjectView> {
+pub(super) fn views(gaussians: Gaussians, poses: &[(DQuat, DVec3)], cameras: Cameras) -> Vec<ObjectView> {
     let group_of = vec![0; gaussians.len()];
     views_of_groups(gaussians, group_of, &[poses.to_vec()], cameras)
 }
 
 /// Views of Gaussians in groups, each on its way.
-pub(crate) fn views_of_groups(
+pub(super) fn views_of_groups(
     gaussians: Gaussians,
     group_of: Vec<u32>,
     poses: &[Vec<(DQuat, DVec3)>],
@@ -84,7 +84,7 @@ pub(crate) fn views_of_groups(
 }
 
 /// The same in masks that are not exact.
-pub(crate) fn views_in_masks(
+pub(super) fn views_in_masks(
     (gaussians, group_of): (Gaussians, Vec<u32>),
     poses: &[Vec<(DQuat, DVec3)>],
     cameras: Cameras,
@@ -168,7 +168,7 @@ pub(super) fn shaped(
 }
 
 /// Patches of colour.
-pub(crate) fn patches(p: DVec3) -> [f32; 3] {
+pub(super) fn patches(p: DVec3) -> [f32; 3] {
     let cell = (p * 40.0).floor();
     std::array::from_fn(|k| {
         let wave = (cell.x * (2.1 + k as f64) + cell.y * 3.7 + cell.z * (5.3 - k as f64)).sin();
@@ -176,7 +176,7 @@ pub(crate) fn patches(p: DVec3) -> [f32; 3] {
     })
 }
 
-pub(crate) fn sphere_places(radius: f64) -> Vec<DVec3> {
+pub(super) fn sphere_places(radius: f64) -> Vec<DVec3> {
     let mut rng = stream(0, Purpose::Objects, 10);
     (0..1200)
         .map(|_| {

@@ -12,7 +12,7 @@ use super::fit::{Fit, Turns};
 use super::follow::follow;
 use super::outline::Outline;
 use super::path::smooth;
-use super::rotation::{Course, Judge};
+use super::rotation::{Course, is_observed};
 use super::start::{Object, Started};
 use super::texture;
 use super::view::ObjectView;
@@ -206,16 +206,11 @@ pub(super) fn best_way<'a>(
 }
 
 impl<'a> Contest<'a> {
-    /// True where the judge tells the turns of poses from those of all ways that differ by more than 30 degrees.
+    /// True where the images show the turns of poses, and not those of any way that differs.
     fn shows(&self, poses: &Course) -> bool {
-        let paths = &self.paths;
-        let size = self.object.outline.size();
-        let Some(mut judge) = Judge::new(self.object.views, size, paths.poses(Way::Slide(0))) else {
-            return false;
-        };
-        let turns = paths.ways().into_iter().chain(paths.spins()).map(|way| paths.poses(way));
-        judge.add(std::iter::once(poses.clone()).chain(turns).collect());
-        judge.tells(1)
+        let (paths, seen) = (&self.paths, (self.object.views, self.object.outline.size()));
+        let rivals = paths.ways().into_iter().chain(paths.spins()).map(|way| paths.poses(way));
+        is_observed(seen, poses, paths.poses(Way::Slide(0)), rivals)
     }
 
     /// Trials of resting, and of moving along the path without a turn: most objects that do not travel rest.

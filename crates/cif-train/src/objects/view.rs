@@ -37,12 +37,12 @@ const SAME: (f64, f64) = (0.02, 0.05);
 const DISC: f64 = 0.9;
 
 /// The crop at a resolution.
-pub(crate) struct Crop {
-    pub(crate) camera: PinholeCamera,
+pub(super) struct Crop {
+    pub(super) camera: PinholeCamera,
     /// Mean colour of the mask's share of each pixel, in [0, 1].
-    pub(crate) colors: Vec<[f32; 3]>,
+    pub(super) colors: Vec<[f32; 3]>,
     /// Share of each pixel that the mask has.
-    pub(crate) mask: Vec<f32>,
+    pub(super) mask: Vec<f32>,
     /// Weight of the coverage of each pixel: 0 where other objects are, which may hide this one.
     pub(super) known: Vec<f32>,
     /// Pixels of the mask, at least 4.
@@ -53,11 +53,11 @@ pub(crate) struct Crop {
 }
 
 /// The object in a frame.
-pub(crate) struct ObjectView {
-    pub(crate) time_index: usize,
+pub(super) struct ObjectView {
+    pub(super) time_index: usize,
     /// Number that tells cameras that stay in place apart.
-    pub(crate) camera_key: [i64; 3],
-    pub(crate) camera: PinholeCamera,
+    pub(super) camera_key: [i64; 3],
+    pub(super) camera: PinholeCamera,
     /// Pixels of the mask: columns and rows.
     pub(super) pixels: Vec<[u32; 2]>,
     /// Size of the image.
@@ -70,7 +70,7 @@ pub(crate) struct ObjectView {
     /// Visible share: area over the median area of the nearest whole masks, at most 1.
     pub(super) visible: f64,
     /// By reduction: 1, 2, 4.
-    pub(crate) crops: [Crop; 3],
+    pub(super) crops: [Crop; 3],
     label: u16,
     /// By label, true for those that cannot hide it.
     behind: Arc<[bool]>,
@@ -79,7 +79,7 @@ pub(crate) struct ObjectView {
 
 /// Finding at a pixel of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Seen {
+pub(super) enum Seen {
     /// The object, in this colour.
     Object([f32; 3]),
     /// Another object, which may hide this one.
@@ -127,7 +127,7 @@ impl ObjectView {
         })
     }
 
-    pub(crate) fn area(&self) -> f64 {
+    pub(super) fn area(&self) -> f64 {
         self.pixels.len() as f64
     }
 
@@ -152,7 +152,7 @@ impl ObjectView {
     }
 
     /// True where the mask may move a pose.
-    pub(crate) fn is_reliable(&self) -> bool {
+    pub(super) fn is_reliable(&self) -> bool {
         !self.cut && self.visible > 0.5
     }
 
@@ -184,7 +184,7 @@ impl ObjectView {
     }
 
     /// Finding where a point of the world is seen.
-    pub(crate) fn at(&self, point: glam::DVec3) -> Seen {
+    pub(super) fn at(&self, point: glam::DVec3) -> Seen {
         let Some([x, y]) = self.camera.pixel_of(point) else { return Seen::Outside };
         match self.frame.labels.as_ref().map_or(UNLABELLED, |labels| *labels.at(x, y)) {
             label if label == self.label => {

@@ -19,8 +19,6 @@ pub(super) fn compared(evidence: &Evidence<'_>, fields: &[&[f32]]) -> Vec<Vec<f6
     for look in &evidence.looks {
         bounds.push(bounds[bounds.len() - 1] + look.pixels.len());
     }
-    let mut times: Vec<usize> = evidence.looks.iter().map(|look| look.view.time_index).collect();
-    times.dedup();
     let of_view = |a: &[f32], b: &[f32], view: usize| {
         let range = bounds[view]..bounds[view + 1];
         let (mut sum, mut count) = (0.0_f64, 0_u32);

@@ -10,8 +10,8 @@
 //!   world normal `n`.
 //!
 //! Errors are mean absolute residuals, of the layered model the length over brightness and two ratios of colours, in nat
-//! (0.01 is one percent of brightness). Only the layered model tells a turn; that there is none, the
-//! shaded one tells too.
+//! (0.01 is one percent of brightness). Only the layered model shows a turn; that there is none, the
+//! shaded one shows too.
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
@@ -19,11 +19,12 @@ use rayon::prelude::*;
 use super::super::view::ObjectView;
 use super::compare::compared;
 use super::evidence::{Evidence, Look};
+use super::folds::FEWEST;
 use super::hull::{Course, Grid, Hit, Hull};
 use super::layered::layered;
 use super::shaded::shaded;
 
-/// Standard errors by which a hypothesis must beat another to be told from it.
+/// Standard errors by which a hypothesis must beat another.
 const SIGMAS: f64 = 2.0;
 
 /// Difference of two courses of rotation, radians, up to which they are the same to the judge: the truth lies within half
@@ -32,9 +33,6 @@ const APART: f64 = 30.0 / 180.0 * std::f64::consts::PI;
 
 /// Cosine at which a surface is seen too flat to be compared.
 const GRAZING: f64 = 0.3;
-
-/// Pixels in all below which the hull without turns tells no layer of light.
-const FEWEST: usize = 60;
 
 /// Edge of a voxel, in pixels at the distance of the object: cells of paint are as fine as what is seen of them. Most
 /// voxels along an object, and edge of those of a first rough hull, of its size.
@@ -52,13 +50,24 @@ const LEAST_VOLUME: f64 = 1.0 / 3.0;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Verdict {
     /// Place of the best hypothesis.
-    pub(in super::super) best: usize,
-    /// Standard errors by which it beats the nearest rival that differs by more than 30 degrees.
-    pub(in super::super) margin: f64,
-    /// True where it beats every such rival by two standard errors: the rotation is observed.
-    pub(in super::super) is_observed: bool,
+    pub(super) best: usize,
+    /// True where it beats every rival that differs by more than 30 degrees by two standard errors.
+    pub(super) is_observed: bool,
     /// True where it differs from no turn by more than 30 degrees.
-    pub(in super::super) turns: bool,
+    pub(super) turns: bool,
+}
+
+/// True where the images of an object of this size (the larger of half height and radius, metres) show the rotations of
+/// poses: these, or others within 30 degrees of them, beat all rivals and the course without turns that differ by more.
+pub(in super::super) fn is_observed(
+    (views, size): (&[ObjectView], f64),
+    poses: &Course,
+    unturned: Course,
+    rivals: impl IntoIterator<Item = Course>,
+) -> bool {
+    let Some(mut judge) = Judge::new(views, size, unturned) else { return false };
+    judge.add(std::iter::once(poses.clone()).chain(rivals).collect());
+    judge.verdict().is_some_and(|found| found.is_observed && judge.angle(found.best, 1) <= APART)
 }
 
 /// Residuals of one hypothesis by pixel; NaN where it predicts nothing.
@@ -70,7 +79,7 @@ struct Residuals {
 }
 
 /// Hypotheses about one object, and how well each explains its pixels.
-pub(in super::super) struct Judge<'a> {
+pub(super) struct Judge<'a> {
     evidence: Evidence<'a>,
     /// Size of the object and edge of a voxel, metres.
     size: f64,
@@ -84,7 +93,7 @@ pub(in super::super) struct Judge<'a> {
 impl<'a> Judge<'a> {
     /// A judge of an object of this size (the larger of half height and radius, metres) with a first hypothesis, under
     /// which it does not turn; `None` where the views are too few.
-    pub(in super::super) fn new(views: &'a [ObjectView], size: f64, unturned: Course) -> Option<Self> {
+    pub(super) fn new(views: &'a [ObjectView], size: f64, unturned: Course) -> Option<Self> {
         let evidence = Evidence::of(views)?;
         let footprint = |look: &Look<'_>| {
             let pose = unturned.get(&look.view.time_index)?;
@@ -109,7 +118,7 @@ impl<'a> Judge<'a> {
     }
 
     /// Adds hypotheses.
-    pub(in super::super) fn add(&mut self, courses: Vec<Course>) {
+    pub(super) fn add(&mut self, courses: Vec<Course>) {
         let of = |course: &Course| {
             let (hull, hits) = self.seen(course);
             self.residuals_of(course, (&hull, &hits), true)
@@ -119,18 +128,11 @@ impl<'a> Judge<'a> {
         self.courses.extend(courses);
     }
 
-    /// True where a hypothesis is observed: it, or one within 30 degrees of it, beats all others.
-    pub(in super::super) fn tells(&self, place: usize) -> bool {
-        let times: Vec<usize> = self.evidence.looks.iter().map(|look| look.view.time_index).collect();
-        self.verdict().is_some_and(|found| {
-            found.is_observed && angles(&self.courses, &times)[found.best][place] <= APART
-        })
-    }
-
     /// The finding about the hypotheses so far; `None` where none can be compared with another.
     pub(super) fn verdict(&self) -> Option<Verdict> {
-        let times: Vec<usize> = self.evidence.looks.iter().map(|look| look.view.time_index).collect();
-        let angles = angles(&self.courses, &times);
+        let count = self.courses.len();
+        let angles: Vec<Vec<f64>> =
+            (0..count).map(|a| (0..count).map(|b| self.angle(a, b)).collect()).collect();
         let largest = self.residuals.iter().map(|residuals| residuals.volume).fold(0.0, f64::max);
         let is_out: Vec<bool> = self.residuals.iter().map(|r| r.volume < LEAST_VOLUME * largest).collect();
         let verdict = |of: fn(&Residuals) -> &[f32]| {
@@ -141,10 +143,23 @@ impl<'a> Judge<'a> {
         if by_layers.is_some_and(|found| found.is_observed && found.turns) {
             return by_layers;
         }
-        // Places that are a little off look like turns to it, so that it does not tell one alone.
+        // Places that are a little off look like turns to it.
         let by_shading = verdict(|residuals| &residuals.shaded)?;
         let is_observed = by_shading.is_observed && !by_shading.turns;
         Some(Verdict { is_observed, ..by_shading })
+    }
+
+    /// Largest angle between two hypotheses, radians: both are taken relative to the middle of the times at which they have
+    /// poses, for frames of objects are arbitrary.
+    fn angle(&self, a: usize, b: usize) -> f64 {
+        let of = |look: &Look<'_>| {
+            let rotation = |k: usize| Some(self.courses[k].get(&look.view.time_index)?.rotation);
+            Some((rotation(a)?, rotation(b)?))
+        };
+        let shared: Vec<(DQuat, DQuat)> = self.evidence.looks.iter().filter_map(of).collect();
+        let Some((first, second)) = shared.get(shared.len() / 2) else { return 0.0 };
+        let (first, second) = (first.inverse(), second.inverse());
+        shared.iter().map(|(a, b)| (*a * first).angle_between(*b * second)).fold(0.0, f64::max)
     }
 
     /// Hull of a hypothesis, and what pixels see of it.
@@ -167,19 +182,6 @@ impl<'a> Judge<'a> {
             volume: hull.volume(),
         }
     }
-}
-
-/// Largest angle between two courses at some times, radians, for every pair: both are taken relative to the middle of the
-/// times at which they have poses, for frames of objects are arbitrary.
-fn angles(courses: &[Course], times: &[usize]) -> Vec<Vec<f64>> {
-    let between = |a: &Course, b: &Course| {
-        let of = |time: &usize| Some((a.get(time)?.rotation, b.get(time)?.rotation));
-        let shared: Vec<(DQuat, DQuat)> = times.iter().filter_map(of).collect();
-        let Some((first, second)) = shared.get(shared.len() / 2) else { return 0.0 };
-        let (first, second) = (first.inverse(), second.inverse());
-        shared.iter().map(|(a, b)| (*a * first).angle_between(*b * second)).fold(0.0, f64::max)
-    };
-    courses.iter().map(|a| courses.iter().map(|b| between(a, b)).collect()).collect()
 }
 
 /// Surface points of all pixels.
@@ -224,5 +226,5 @@ fn verdict(compared: &[Vec<f64>], angles: &[Vec<f64>], is_out: &[bool]) -> Optio
     };
     let margins = (0..count).filter(|a| is_live[*a]).filter_map(|a| Some((a, margin(a)?)));
     let (best, margin) = margins.max_by(|a, b| a.1.total_cmp(&b.1))?;
-    Some(Verdict { best, margin, is_observed: margin > SIGMAS, turns: angles[best][0] > APART })
+    Some(Verdict { best, is_observed: margin > SIGMAS, turns: angles[best][0] > APART })
 }

@@ -120,8 +120,6 @@ impl Layers {
         self.light.values = light;
         self.light.divide(1.0);
         if turns {
-            let fitted =
-                || seen.iter().zip(&self.is_fitted).filter(|(_, is_fitted)| **is_fitted).map(|(o, _)| o);
             let mut paint = vec![DVec3::ZERO; self.paint.values.len()];
             for o in fitted() {
                 paint[o.paint] += o.value - self.gain.values[o.look] - self.light.values[o.light];

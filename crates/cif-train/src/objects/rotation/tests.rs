@@ -6,8 +6,8 @@ use glam::{DQuat, DVec3};
 
 use super::super::shape::Pose;
 use super::super::testing::{Cameras, TIMES, jumping, moving, patches, rig, solid, sphere_places, views};
-use super::judge::Verdict;
-use super::{Course, Judge};
+use super::Course;
+use super::judge::{Judge, Verdict};
 
 const RADIUS: f64 = 0.06;
 
@@ -69,7 +69,7 @@ fn what_stays_is_not_seen_to_turn() {
 }
 
 #[test]
-fn what_rolls_is_not_told_to_slide_and_the_reverse() {
+fn what_rolls_is_not_judged_to_slide_and_the_reverse() {
     let place = |time: usize| DVec3::new(0.3 * share(time) - 0.15, 0.0, RADIUS);
     let rolls = (0.3 / RADIUS) * 180.0 / PI;
     let turns = [0.0, 0.5 * rolls, 0.75 * rolls, rolls, 1.25 * rolls, -rolls];
@@ -80,7 +80,7 @@ fn what_rolls_is_not_told_to_slide_and_the_reverse() {
 }
 
 #[test]
-fn a_plain_ball_tells_no_turn() {
+fn a_plain_ball_shows_no_turn() {
     for cameras in [moving as Cameras, rig as Cameras] {
         let found = judged((135.0, &TURNS), DVec3::Z, stays, |_| [0.7, 0.5, 0.3], cameras);
         assert!(!found.is_observed || found.best == 0, "{found:?}");
