@@ -1,7 +1,7 @@
 //! Numerically hard cases of rendering, through every renderer in both directions; numbers are rows of methods
 //! reference 7. `tests/README.md` lists them with the worst errors that these tests print.
 
-use cif_field::parameters::{LOG_SCALES, MLP, OCCUPANCY_LOGITS, PLANES, Parameter, TABLE};
+use cif_field::parameters::{LOG_SCALES, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, Parameter, TABLE};
 use cif_field::{Field, Identities};
 use cif_geometry::scalar::{logit, sigmoid};
 use cif_geometry::{PinholeCamera, PixelGrid, Real};
@@ -118,6 +118,9 @@ struct Errors {
 /// Most Gaussians whose every parameter is moved for central differences.
 const FEW: usize = 8;
 
+/// Relative distance of a weight or a transmittance from a threshold within which they may decide differently.
+const MARGIN: f64 = 1e-3;
+
 /// Measures a view against the `f64` reference, and that against central differences where asked to. Pixels at a
 /// threshold, where two may decide differently, take no part.
 fn errors(
@@ -134,9 +137,18 @@ fn errors(
     let unmasked = reference::forward(&scene, camera, time, settings, Some(&view.labels));
     let mut cotangents = Cotangents::random(5, width, height);
     (cotangents.depth, cotangents.alpha) = (None, None);
-    let band: Vec<bool> = (0..unmasked.pixels.pixels.len())
-        .map(|position| pixel_discontinuity(&unmasked, position, 1e-3).is_some())
-        .collect();
+    // What is too faint for any weight by less than the margin is drawn or not.
+    let mut raised = scene.clone();
+    for (row, _) in unmasked.splats.iter().enumerate().filter(|(_, splat)| splat.is_none()) {
+        for logits in [OPACITY_LOGITS, OCCUPANCY_LOGITS] {
+            *raised.parameters.get_mut(logits, row) += MARGIN;
+        }
+    }
+    let raised = reference::forward(&raised, camera, time, settings, Some(&view.labels));
+    let meets = |position| {
+        [&unmasked, &raised].into_iter().any(|seen| pixel_discontinuity(seen, position, MARGIN).is_some())
+    };
+    let band: Vec<bool> = (0..unmasked.pixels.pixels.len()).map(meets).collect();
     for (position, _) in band.iter().enumerate().filter(|(_, near)| **near) {
         cotangents.color.pixels[position] = [0.0; 3];
         view.labels.pixels[position] = 0;
@@ -939,6 +951,23 @@ proptest! {
         let camera = plain_camera(size.0, size.1, 20.0);
         for (column, [forward, _]) in errors("fuzz", &field, &settings, (&camera, 0.5), false).of {
             prop_assert!(forward < 2e-4, "colours of {:?} differ by {}", column, forward);
+        }
+    }
+}
+
+#[test]
+fn strengths_beside_the_least_weight_are_drawn_or_not() {
+    let config = SyntheticConfig { gaussians: 1, instances: 1, ..SyntheticConfig::default() };
+    let mut field = generate(&config).field;
+    // On the centre of a pixel, where its weight is its strength.
+    field.gaussians.means[0] = [-0.05, -0.05, 2.0];
+    field.gaussians.occupancy_logits[0] = logit(0.001) as f32;
+    let camera = plain_camera(16, 16, 20.0);
+    for ulps in -3..=3 {
+        let least = logit(1.0 / 255.0) as f32;
+        field.gaussians.opacity_logits[0] = f32::from_bits(least.to_bits().wrapping_add_signed(ulps));
+        for (column, [forward, _]) in errors("least", &field, &settings(), (&camera, 0.5), false).of {
+            assert!(forward < 2e-4, "{ulps}: colours of {column:?} differ by {forward}");
         }
     }
 }

@@ -19,7 +19,7 @@ use super::order::Order;
 use super::outline::{Outline, meeting_point};
 use super::path::smooth;
 use super::plane::Plane;
-use super::rotation::is_observed;
+use super::rotation::shown;
 use super::shape::{Pose, Shape};
 use super::trials::{self, GAUSSIANS, STEPS};
 use super::view::{ObjectView, is_one_camera, median};
@@ -378,7 +378,7 @@ impl<'a> Object<'a> {
             let rotation = |time: usize| DQuat::from_axis_angle(up, angle(time).to_radians());
             path.iter().map(|(t, place)| (*t, Pose { rotation: rotation(*t), translation: *place })).collect()
         };
-        is_observed((self.views, self.outline.size()), poses, turning(0), RIVALS.map(turning))
+        shown((self.views, self.outline.size()), poses, turning(0), RIVALS.map(turning)).is_some()
     }
 
     /// The place where views see it together.

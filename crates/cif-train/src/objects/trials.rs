@@ -12,7 +12,7 @@ use super::fit::{Fit, Turns};
 use super::follow::follow;
 use super::outline::Outline;
 use super::path::smooth;
-use super::rotation::{Course, is_observed};
+use super::rotation::{Course, Shown, shown};
 use super::start::{Object, Started};
 use super::texture;
 use super::view::ObjectView;
@@ -210,7 +210,11 @@ impl<'a> Contest<'a> {
     fn shows(&self, poses: &Course) -> bool {
         let (paths, seen) = (&self.paths, (self.object.views, self.object.outline.size()));
         let rivals = paths.ways().into_iter().chain(paths.spins()).map(|way| paths.poses(way));
-        is_observed(seen, poses, paths.poses(Way::Slide(0)), rivals)
+        match shown(seen, poses, paths.poses(Way::Slide(0)), rivals) {
+            Some(Shown::Turn) => true,
+            Some(Shown::NoTurn) => !paths.may_roll(),
+            None => false,
+        }
     }
 
     /// Trials of resting, and of moving along the path without a turn: most objects that do not travel rest.

@@ -118,14 +118,18 @@ impl Paths<'_> {
         self.reach() >= SHIFTS * self.outline.size()
     }
 
+    /// True where an object on the path may roll: what its rays show off the support flies, and what is tall stands.
+    pub(super) fn may_roll(&self) -> bool {
+        let flies = self.outline.is_surrounded && !self.outline.air.is_empty();
+        let is_low = self.outline.height <= ROLLS_UP_TO * self.outline.radius;
+        self.stands && !flies && is_low && self.reach() >= ROLLS_FROM * self.outline.size()
+    }
+
     /// Ways of moving along the path worth a trial, beside sliding without a turn.
     pub(super) fn ways(&self) -> Vec<Way> {
         let mut ways = Vec::new();
         ways.extend((-180 / SLIDE..=180 / SLIDE).filter(|k| *k != 0).map(|k| Way::Slide(k * SLIDE)));
-        // What its rays show off the support flies.
-        let flies = self.outline.is_surrounded && !self.outline.air.is_empty();
-        let is_low = self.outline.height <= ROLLS_UP_TO * self.outline.radius;
-        if self.stands && !flies && is_low && self.reach() >= ROLLS_FROM * self.outline.size() {
+        if self.may_roll() {
             let radii: &[f64] = if is_round(self.outline) { &ROLLS } else { &OTHER_ROLLS };
             ways.extend(radii.iter().map(|radius| Way::Roll(*radius)));
         }

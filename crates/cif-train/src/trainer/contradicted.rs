@@ -41,15 +41,15 @@ impl Votes {
 }
 
 impl Trainer {
-    /// Takes the Gaussians out of their instance that its masks contradict, but leaves it a few.
+    /// Rows of the Gaussians that the masks of their instance contradict, but for a few of each.
     ///
     /// # Errors
-    /// When a frame cannot be read, or the run is to stop; nothing has changed then.
-    pub(super) fn disown_contradicted(&mut self) -> Result<(), TrainError> {
+    /// When a frame cannot be read, or the run is to stop.
+    pub(super) fn contradicted(&self) -> Result<Vec<usize>, TrainError> {
         if self.state.config.head.name != HeadName::Cif {
-            return Ok(());
+            return Ok(Vec::new());
         }
-        let Some(of) = self.state.field.instance_of_gaussians() else { return Ok(()) };
+        let Some(of) = self.state.field.instance_of_gaussians() else { return Ok(Vec::new()) };
         let votes = self.votes(&of)?;
         let mut members: Vec<Vec<usize>> = vec![Vec::new(); self.state.field.instances.len()];
         for (row, instance) in of.iter().enumerate() {
@@ -57,8 +57,7 @@ impl Trainer {
                 members[usize::from(*instance)].push(row);
             }
         }
-        let Some(identities) = &mut self.state.field.identities else { return Ok(()) };
-        let shares = identities.labelled_shares();
+        let mut rows = Vec::new();
         for members in members {
             let (mut contradicted, others): (Vec<usize>, Vec<usize>) =
                 members.into_iter().partition(|row| votes[*row].contradict());
@@ -66,14 +65,21 @@ impl Trainer {
             let margin = |row: &usize| i64::from(votes[*row].inside) - i64::from(votes[*row].beside);
             contradicted.sort_by_key(|row| std::cmp::Reverse(margin(row)));
             let spared = FEWEST_OF_OBJECT.saturating_sub(others.len());
-            for row in contradicted.into_iter().skip(spared).filter(|row| shares[*row] > LIMIT) {
-                let shift = (LIMIT / shares[row]).ln();
-                let range = identities.range(row);
-                identities.log_estimates[range].iter_mut().for_each(|estimate| *estimate += shift);
-            }
+            rows.extend(contradicted.into_iter().skip(spared));
+        }
+        Ok(rows)
+    }
+
+    /// Takes Gaussians out of their instance.
+    pub(super) fn disown(&mut self, rows: &[usize]) {
+        let Some(identities) = &mut self.state.field.identities else { return };
+        let shares = identities.labelled_shares();
+        for row in rows.iter().copied().filter(|row| shares[*row] > LIMIT) {
+            let shift = (LIMIT / shares[row]).ln();
+            let range = identities.range(row);
+            identities.log_estimates[range].iter_mut().for_each(|estimate| *estimate += shift);
         }
         self.engine.changed(Changed::Identities);
-        Ok(())
     }
 
     /// Votes of training views on every Gaussian that belongs to the instance of `of`; none on those with poses, which were
@@ -169,7 +175,8 @@ mod tests {
             trainer.state.field.gaussians.means[*row] = place.as_vec3().to_array();
         }
         let before = trainer.state.field.identities.clone().unwrap();
-        trainer.disown_contradicted().unwrap();
+        let contradicted = trainer.contradicted().unwrap();
+        trainer.disown(&contradicted);
         let after = trainer.state.field.identities.as_ref().unwrap();
         let [shares, first] = [after, &before].map(cif_field::Identities::labelled_shares);
         assert!(moved.iter().all(|row| (shares[*row] - LIMIT).abs() < 1e-6));
@@ -187,7 +194,8 @@ mod tests {
         for row in &rows {
             trainer.state.field.gaussians.means[*row][1] -= 1.0;
         }
-        trainer.disown_contradicted().unwrap();
+        let contradicted = trainer.contradicted().unwrap();
+        trainer.disown(&contradicted);
         let shares = trainer.state.field.identities.as_ref().unwrap().labelled_shares();
         let owned = rows.iter().filter(|row| shares[**row] > 2.0 * LIMIT).count();
         assert!((FEWEST_OF_OBJECT..rows.len() / 2).contains(&owned), "{owned} of {}", rows.len());

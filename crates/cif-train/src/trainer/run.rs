@@ -223,9 +223,10 @@ impl Trainer {
             }
         }
         if stage == Stage::Instance {
-            // The last that may be stopped in this stage: it must not be done twice.
+            // Nothing behind the first change may be stopped: it must not be done twice.
+            let contradicted = self.contradicted()?;
             self.sharpen_shares()?;
-            self.disown_contradicted()?;
+            self.disown(&contradicted);
         }
         let wall_s = self.progress().stages_s.get(stage.name()).copied().unwrap_or(0.0);
         let gaussians = self.state.field.gaussians.len();

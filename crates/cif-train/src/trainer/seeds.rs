@@ -79,8 +79,8 @@ impl Trainer {
         Ok(looks.into_keys().filter(lacks).collect())
     }
 
-    /// Gaussians for one object on its path: inside all of its masks and, where these leave hardly room, as of a thin thing
-    /// that turns, inside the one that shows most of it.
+    /// Gaussians for one object on its path: inside all of its masks or, where these leave no room, as of a thin thing that
+    /// turns, inside the one that shows most of it.
     pub(super) fn seed(&mut self, label: u16, track: Track, seen: &[Observation]) -> Result<(), TrainError> {
         // The canonical pose is the one that shows most of it.
         let Some(best) = seen.iter().max_by(|a, b| {
@@ -91,12 +91,11 @@ impl Trainer {
         let times = &self.state.dataset.times;
         let reference = track.at(times, times[best.time_index]);
         let (mut positions, mut colors) = self.inside_masks(label, &track, reference, seen)?;
-        // About one a pixel draws it as it is seen.
-        let wanted = (self.state.config.motion.gaussians as usize).min(best.area_px as usize);
-        let (more, of_more) =
-            self.inside_mask(label, reference, best, wanted.saturating_sub(positions.len()))?;
-        positions.extend(more);
-        colors.extend(of_more);
+        if positions.len() < FEWEST_OF_OBJECT {
+            // About one a pixel draws it as it is seen.
+            let wanted = (self.state.config.motion.gaussians as usize).min(best.area_px as usize);
+            (positions, colors) = self.inside_mask(label, reference, best, wanted)?;
+        }
         if positions.len() < FEWEST_OF_OBJECT {
             return Ok(());
         }

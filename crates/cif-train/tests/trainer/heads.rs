@@ -113,6 +113,8 @@ impl ValueHead for Scored {
 fn config() -> TrainConfig {
     let mut config = small_config();
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (40, 40, 80);
+    // So few steps do not teach where the third ball goes.
+    config.motion.rehearsal = 300;
     config.report.step_every = 1;
     config.report.evaluate_every = 160;
     config

@@ -57,17 +57,29 @@ pub(super) struct Verdict {
     pub(super) turns: bool,
 }
 
-/// True where the images of an object of this size (the larger of half height and radius, metres) show the rotations of
-/// poses: these, or others within 30 degrees of them, beat all rivals and the course without turns that differ by more.
-pub(in super::super) fn is_observed(
+/// Kind of rotation that images show.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in super::super) enum Shown {
+    /// One that differs from no turn by more than 30 degrees.
+    Turn,
+    /// None. Shading, which stays where it is while a plain thing rolls, shows this too.
+    NoTurn,
+}
+
+/// The kind of rotation that the images of an object of this size (the larger of half height and radius, metres) show,
+/// where it is that of poses: these, or others within 30 degrees of them, beat all rivals and the course without turns
+/// that differ by more.
+pub(in super::super) fn shown(
     (views, size): (&[ObjectView], f64),
     poses: &Course,
     unturned: Course,
     rivals: impl IntoIterator<Item = Course>,
-) -> bool {
-    let Some(mut judge) = Judge::new(views, size, unturned) else { return false };
+) -> Option<Shown> {
+    let mut judge = Judge::new(views, size, unturned)?;
     judge.add(std::iter::once(poses.clone()).chain(rivals).collect());
-    judge.verdict().is_some_and(|found| found.is_observed && judge.angle(found.best, 1) <= APART)
+    let found = judge.verdict()?;
+    let is_shown = found.is_observed && judge.angle(found.best, 1) <= APART;
+    is_shown.then_some(if found.turns { Shown::Turn } else { Shown::NoTurn })
 }
 
 /// Residuals of one hypothesis by pixel; NaN where it predicts nothing.

@@ -19,4 +19,4 @@ mod shaded;
 mod tests;
 
 pub(super) use self::hull::Course;
-pub(super) use self::judge::is_observed;
+pub(super) use self::judge::{Shown, shown};

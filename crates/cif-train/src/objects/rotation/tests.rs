@@ -7,7 +7,7 @@ use glam::{DQuat, DVec3};
 use super::super::shape::Pose;
 use super::super::testing::{Cameras, TIMES, jumping, moving, patches, rig, solid, sphere_places, views};
 use super::Course;
-use super::judge::{Judge, Verdict};
+use super::judge::{Judge, Shown, Verdict, shown};
 
 const RADIUS: f64 = 0.06;
 
@@ -85,4 +85,24 @@ fn a_plain_ball_shows_no_turn() {
         let found = judged((135.0, &TURNS), DVec3::Z, stays, |_| [0.7, 0.5, 0.3], cameras);
         assert!(!found.is_observed || found.best == 0, "{found:?}");
     }
+}
+
+#[test]
+fn shading_of_a_plain_ball_that_rolls_is_told_from_a_turn() {
+    let place = |time: usize| DVec3::new(0.3 * share(time) - 0.15, 0.0, RADIUS);
+    let rolls = |degrees: f64| course(degrees, DVec3::Y, place);
+    let whole = (0.3 / RADIUS).to_degrees();
+    let of = |color: fn(DVec3) -> [f32; 3], claimed: f64| {
+        let seen = views(solid(&sphere_places(RADIUS), color, 0.007), &poses(&rolls(whole)), moving);
+        shown(
+            (&seen, RADIUS),
+            &rolls(claimed),
+            rolls(0.0),
+            [0.5, 0.75, 1.0, 1.25].map(|share| rolls(share * whole)),
+        )
+    };
+    assert_eq!(of(patches, whole), Some(Shown::Turn));
+    assert_eq!(of(patches, 0.0), None);
+    assert_ne!(of(|_| [0.7, 0.5, 0.3], whole), Some(Shown::Turn));
+    assert_ne!(of(|_| [0.7, 0.5, 0.3], 0.0), Some(Shown::Turn));
 }
