@@ -81,7 +81,7 @@ pub use checkpoint::{Checkpoint, CheckpointError, StateTensor, TrainingState};
 pub use deformation::{Deformation, DeformationConfig, Heads, TimeEncoding};
 pub use embedding::{Embedding, Embeddings};
 pub use error::FieldError;
-pub use exposure::Exposure;
+pub use exposure::{Exposure, TimedExposure};
 pub use field::{Field, SortMetric};
 pub use gaussians::{Gaussians, GaussiansMut};
 pub use identity::{Identities, Owner};

@@ -12,7 +12,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
-use crate::{Embeddings, Exposure};
+use crate::{Embeddings, Exposure, TimedExposure};
 
 /// Origin of a field, and the settings by which a renderer shows it as it was trained.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -111,6 +111,26 @@ pub struct Drawing {
     /// Exposure of every camera; empty where all record them as they are.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub exposures: BTreeMap<String, Exposure>,
+    /// Exposures of cameras that record otherwise from time to time, in the order of times.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub exposures_in_time: BTreeMap<String, Vec<TimedExposure>>,
+}
+
+impl Drawing {
+    /// Exposure of a camera at a time; `None` of a camera whose exposure is not known.
+    #[must_use]
+    pub fn exposure(&self, camera: &str, time: f64) -> Option<Exposure> {
+        match self.exposures_in_time.get(camera) {
+            Some(series) => TimedExposure::at(series, time),
+            None => self.exposures.get(camera).copied(),
+        }
+    }
+
+    /// True where exposures of cameras are known.
+    #[must_use]
+    pub fn has_exposures(&self) -> bool {
+        !self.exposures.is_empty() || !self.exposures_in_time.is_empty()
+    }
 }
 
 /// A training run.
@@ -299,6 +319,7 @@ fn drawing_of_older_files(settings: Option<&Value>, run: Option<&mut Run>) -> Dr
         antialiased: setting("/antialiased").and_then(Value::as_bool),
         opacity_is_occupancy: ablations.is_some_and(|names| names.contains(&json!("opacity-occupancy"))),
         exposures: run.and_then(|run| take(&mut run.notes, EXPOSURES)).unwrap_or_default(),
+        exposures_in_time: BTreeMap::new(),
     }
 }
 
@@ -335,7 +356,7 @@ mod tests {
         let record = Record::from_json(older()).unwrap();
         assert_eq!(record.frame, CaptureFrame { offset: [3e6, -2e5, 14.5], scale: 0.001 });
         assert_eq!(record.capture.as_deref(), Some("table"));
-        let Drawing { near, antialiased, opacity_is_occupancy, exposures } = &record.drawing;
+        let Drawing { near, antialiased, opacity_is_occupancy, exposures, .. } = &record.drawing;
         assert_eq!((*near, *antialiased, *opacity_is_occupancy), (Some(0.25), Some(true), true));
         assert_eq!(exposures["left"].gain, [1.25, 1.0, 1.0]);
         let run = record.run.as_ref().unwrap();

@@ -122,7 +122,8 @@ impl State {
     /// The picture that the camera of a frame records of a rendered one.
     pub(crate) fn recorded(&self, index: usize, mut rendered: RenderedImage) -> RenderedImage {
         if let Some(exposures) = &self.progress.exposures {
-            exposures.at(&self.dataset.frames[index].camera_name).apply(&mut rendered.color);
+            let frame = &self.dataset.frames[index];
+            exposures.at(&frame.camera_name, frame.time).apply(&mut rendered.color);
         }
         rendered
     }

@@ -95,6 +95,10 @@ struct GroupReport<'a> {
     frames: usize,
     /// Mean PSNR over images that are not equal to their truth, dB.
     psnr: Option<f64>,
+    /// The same of the mean look, without the exposures of cameras; null where training learnt none.
+    psnr_mean_look: Option<f64>,
+    /// The same with the colours of each image fitted to its truth by an affine map.
+    psnr_color_fitted: Option<f64>,
     /// The same over co-visible pixels, those that a training view shows; null where it was not asked for.
     psnr_covisible: Option<f64>,
     /// Co-visible pixels, mean percent of an image; null where it was not asked for.
@@ -211,6 +215,8 @@ fn group_report<'a>(scores: &'a Scores, field: &Field) -> GroupReport<'a> {
     GroupReport {
         frames: scores.frames,
         psnr: scores.psnr,
+        psnr_mean_look: scores.psnr_mean_look,
+        psnr_color_fitted: scores.psnr_color_fitted,
         psnr_covisible: scores.psnr_covisible,
         covisible: scores.covisible,
         ssim: scores.ssim,

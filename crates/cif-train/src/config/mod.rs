@@ -392,6 +392,8 @@ pub struct EffectsConfig {
     pub physics: bool,
     /// True when an exposure and a white balance are learnt for every camera, default no.
     pub exposure: bool,
+    /// True when they are learnt for every training image instead, and change evenly from one to the next, default no.
+    pub exposure_in_time: bool,
 }
 
 /// Reports, evaluations and checkpoints on the way.

@@ -343,6 +343,7 @@ impl Default for EffectsConfig {
             head_gain: 0.0,
             physics: true,
             exposure: false,
+            exposure_in_time: false,
         }
     }
 }

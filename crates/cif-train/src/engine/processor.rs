@@ -125,7 +125,7 @@ impl Processor {
         let settings = RenderSettings { instances, ..plan.settings };
         let pass = self.renderer.forward(&state.field, &frame.camera, time, &settings, labels);
         let mut since = Instant::now();
-        let exposure = state.progress.exposures.as_ref().map(|all| all.at(&frame.camera_name));
+        let exposure = state.progress.exposures.as_ref().map(|all| all.at(&frame.camera_name, time));
         let recorded = exposure.map(|exposure| {
             let mut recorded = pass.color.clone();
             exposure.apply(&mut recorded);
@@ -158,7 +158,7 @@ impl Processor {
         }
         if let (Some(exposure), Some(all)) = (exposure, &mut state.progress.exposures) {
             let gradient = exposure.pull_back(&pass.color, &mut self.v_color);
-            all.add(&frame.camera_name, &gradient);
+            all.add(&frame.camera_name, time, &gradient);
         }
         reports.push(report);
         if let Some(fault) = self.fault_of_view(color.loss, pass.instance_loss) {

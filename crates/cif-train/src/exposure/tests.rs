@@ -81,45 +81,46 @@ fn a_neutral_exposure_changes_nothing() {
 
 #[test]
 fn a_scene_begins_with_the_exposures_it_was_trained_with() {
-    let known = BTreeMap::from([("b".to_owned(), EXPOSURE), ("gone".to_owned(), EXPOSURE)]);
+    let exposures = BTreeMap::from([("b".to_owned(), EXPOSURE), ("gone".to_owned(), EXPOSURE)]);
+    let known = Drawing { exposures, ..Drawing::default() };
     let exposures = two_cameras().start_with(&known);
-    assert_eq!(exposures.at("a"), Exposure::NEUTRAL);
-    let b = exposures.at("b");
+    assert_eq!(exposures.at("a", 0.3), Exposure::NEUTRAL);
+    let b = exposures.at("b", 0.3);
     assert!(b.gain.iter().zip(EXPOSURE.gain).all(|(a, b)| (a - b).abs() < 1e-6), "{b:?}");
     assert_eq!(b.offset, EXPOSURE.offset);
 }
 
 fn two_cameras() -> Exposures {
-    Exposures::neutral(vec!["a".into(), "b".into()])
+    Exposures::neutral(vec!["a".into(), "b".into()], Vec::new())
 }
 
 #[test]
 fn what_all_cameras_have_in_common_stays_with_the_field() {
     let mut exposures = two_cameras();
     for _ in 0..50 {
-        exposures.add("a", &[1.0; WIDTH]);
-        exposures.add("b", &[1.0; WIDTH]);
-        exposures.add("unknown", &[9.0; WIDTH]);
+        exposures.add("a", 0.3, &[1.0; WIDTH]);
+        exposures.add("b", 0.3, &[1.0; WIDTH]);
+        exposures.add("unknown", 0.3, &[9.0; WIDTH]);
         exposures.step(RATES[0]);
     }
     assert!(exposures.values.iter().all(|value| value.abs() < 1e-6), "{:?}", exposures.values);
-    exposures.add("a", &[1.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    exposures.add("a", 0.3, &[1.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
     exposures.step(RATES[0]);
-    assert!(exposures.at("a").gain[0] < 1.0 && exposures.at("b").gain[0] > 1.0);
-    assert_eq!(exposures.at("c"), Exposure::NEUTRAL);
+    assert!(exposures.at("a", 0.3).gain[0] < 1.0 && exposures.at("b", 0.3).gain[0] > 1.0);
+    assert_eq!(exposures.at("c", 0.3), Exposure::NEUTRAL);
 }
 
 #[test]
 fn gradients_that_are_not_finite_move_nothing() {
     let mut exposures = two_cameras();
-    exposures.add("a", &[0.5; WIDTH]);
+    exposures.add("a", 0.3, &[0.5; WIDTH]);
     assert_eq!(exposures.gradient_beyond(1.0), None);
     assert_eq!(exposures.gradient_beyond(0.1), Some((0, 0.5)));
-    exposures.add("b", &[f32::NAN; WIDTH]);
+    exposures.add("b", 0.3, &[f32::NAN; WIDTH]);
     assert_eq!(exposures.gradient_beyond(1.0).map(|(index, _)| index), Some(WIDTH));
     exposures.step(RATES[0]);
     assert_eq!(exposures.values, two_cameras().values);
-    exposures.add("b", &[1.0; WIDTH]);
+    exposures.add("b", 0.3, &[1.0; WIDTH]);
     exposures.step(RATES[0]);
     assert!(exposures.values.iter().all(|value| value.is_finite()));
 }
@@ -128,11 +129,39 @@ fn gradients_that_are_not_finite_move_nothing() {
 fn saved_exposures_come_back_bit_for_bit() {
     let mut exposures = two_cameras();
     for k in 0..7 {
-        exposures.add(if k % 2 == 0 { "a" } else { "b" }, &[0.1, -0.3, 0.7, 1e-5, -0.2, 0.05]);
+        exposures.add(if k % 2 == 0 { "a" } else { "b" }, 0.3, &[0.1, -0.3, 0.7, 1e-5, -0.2, 0.05]);
         exposures.step(RATES[0]);
     }
     let text = serde_json::to_string(&exposures).unwrap();
     let mut back: Exposures = serde_json::from_str(&text).unwrap();
     back.gradients = exposures.gradients.clone();
     assert_eq!(back, exposures);
+}
+
+#[test]
+fn images_of_a_camera_that_adapts_have_rows_of_their_own() {
+    let mut exposures = Exposures::neutral(vec!["a".into(), "a".into(), "b".into()], vec![0.0, 0.5, 0.0]);
+    assert!(exposures.are_whole());
+    assert_eq!(exposures.position("a", 0.5), Some(1));
+    assert_eq!((exposures.position("a", 0.25), exposures.position("b", 0.5)), (None, None));
+    let gain = |exposures: &Exposures, camera: &str, time: f64| exposures.at(camera, time).gain[0];
+    for _ in 0..50 {
+        exposures.add("a", 0.5, &[-1.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        exposures.step(RATES[0]);
+    }
+    let [first, last] = [0.0, 0.5].map(|time| gain(&exposures, "a", time));
+    assert!(first < 1.0 && last > 1.2, "{first} {last}");
+    // Between two images it changes evenly; beyond them it stays.
+    assert!((gain(&exposures, "a", 0.25) - (first * last).sqrt()).abs() < 1e-5);
+    assert_eq!((gain(&exposures, "a", 1.0), gain(&exposures, "c", 0.0)), (last, 1.0));
+    // Scenes hold them, and begin others with them.
+    assert!(exposures.by_camera().is_empty());
+    let drawing = Drawing { exposures_in_time: exposures.in_time(), ..Drawing::default() };
+    let begun = Exposures::neutral(exposures.cameras.clone(), exposures.times.clone()).start_with(&drawing);
+    assert!(begun.values.iter().zip(&exposures.values).all(|(a, b)| (a - b).abs() < 1e-6));
+    let mut back: Exposures = serde_json::from_str(&serde_json::to_string(&exposures).unwrap()).unwrap();
+    back.gradients = exposures.gradients.clone();
+    assert_eq!(back, exposures);
+    back.times[1] = 0.0;
+    assert!(!back.are_whole(), "two rows of one image");
 }

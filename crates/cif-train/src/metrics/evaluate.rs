@@ -12,9 +12,9 @@ use cif_render::{Channels, OccupancySource, RenderSettings, RenderedImage};
 use serde::Serialize;
 
 use crate::config::TrainConfig;
-use crate::exposure::trained_exposures;
 use crate::heads::Decoder;
 
+use super::color_fit::fitted;
 use super::covisible::TrainingViews;
 use super::image::{masked_psnr, psnr, ssim, unit_color};
 use super::instance::{FrameConfusion, InstanceMetrics, instance_metrics};
@@ -96,6 +96,10 @@ pub struct FrameScores {
     pub time: f64,
     /// dB; `None` when the pictures agree exactly.
     pub psnr: Option<f64>,
+    /// The same of the mean look, without the exposure of the camera; `None` where no exposures were learnt, too.
+    pub psnr_mean_look: Option<f64>,
+    /// The same with the colours fitted to those of the image by an affine map.
+    pub psnr_color_fitted: Option<f64>,
     /// The same over co-visible pixels; `None` when they agree exactly, there are none, or nobody asked.
     pub psnr_covisible: Option<f64>,
     /// Percent of the pixels that are co-visible; `None` when nobody asked.
@@ -115,6 +119,10 @@ pub struct Scores {
     pub frames: usize,
     /// Mean over images with a finite value, dB.
     pub psnr: Option<f64>,
+    /// The same of the mean look, without the exposures of cameras; `None` where none were learnt.
+    pub psnr_mean_look: Option<f64>,
+    /// The same with the colours of each image fitted to its truth by an affine map.
+    pub psnr_color_fitted: Option<f64>,
     /// The same over co-visible pixels.
     pub psnr_covisible: Option<f64>,
     /// Mean percent of the pixels that are co-visible.
@@ -168,7 +176,7 @@ pub fn evaluate<E: From<EvaluationError>>(
     mut observe: impl FnMut(FrameView<'_>) -> Result<(), E>,
 ) -> Result<Evaluation, E> {
     let mut renderer = Renderer::new(options.simd);
-    let exposures = trained_exposures(field);
+    let drawing = &field.record.drawing;
     let mut exposed_frames = 0;
     let by_rows = options.settings.instances.is_some() && options.decoder.is_none();
     let channels = Channels { depth: options.depth || options.covisible, instances: by_rows };
@@ -187,13 +195,15 @@ pub fn evaluate<E: From<EvaluationError>>(
             rendered.instances = Some(decoded);
         }
         let render_ms = start.elapsed().as_secs_f64() * 1e3;
-        if let Some(exposure) = exposures.get(&frame.camera_name) {
+        let target = unit_color(&truth.image);
+        let is_finite = |value: &f64| *value != f64::INFINITY;
+        let mean_look = drawing.has_exposures().then(|| psnr(&rendered.color, &target));
+        if let Some(exposure) = drawing.exposure(&frame.camera_name, frame.time) {
             exposure.apply(&mut rendered.color);
             exposed_frames += 1;
         }
         let predicted = rendered.instances.as_ref().map(|instances| mask_ids(field, &instances.label));
         let confusion = confusions_of(frame, &truth, &rendered, predicted.as_ref());
-        let target = unit_color(&truth.image);
         let shown = training_views.as_ref().map(|views| views.show(&frame.camera, &rendered));
         if !options.depth {
             rendered.depth = None;
@@ -207,8 +217,10 @@ pub fn evaluate<E: From<EvaluationError>>(
             name: frame.name.clone(),
             group: frame.group.clone(),
             time: frame.time,
-            psnr: Some(psnr(&rendered.color, &target)).filter(|value| *value != f64::INFINITY),
-            psnr_covisible: psnr_covisible.filter(|value| *value != f64::INFINITY),
+            psnr: Some(psnr(&rendered.color, &target)).filter(is_finite),
+            psnr_mean_look: mean_look.filter(is_finite),
+            psnr_color_fitted: Some(psnr(&fitted(&rendered.color, &target), &target)).filter(is_finite),
+            psnr_covisible: psnr_covisible.filter(is_finite),
             covisible,
             ssim: ssim(&rendered.color, &target),
             macc_pix: confusion.as_ref().and_then(|c| c.labelled.pixel_accuracy()).map(|v| v * 100.0),
@@ -239,7 +251,7 @@ pub fn evaluate<E: From<EvaluationError>>(
         gaussians: field.gaussians.len(),
         render_ms_per_frame,
         frames,
-        exposed_frames: (!exposures.is_empty()).then_some(exposed_frames),
+        exposed_frames: drawing.has_exposures().then_some(exposed_frames),
     })
 }
 
@@ -314,12 +326,17 @@ fn scores_of<'a>(frames: impl Iterator<Item = &'a FrameScores>, confusions: &[Co
     let of = |pick: fn(&Confusions) -> &FrameConfusion| -> Vec<FrameConfusion> {
         confusions.iter().map(pick).cloned().collect()
     };
+    let mean_of = |pick: fn(&FrameScores) -> Option<f64>| {
+        mean(&frames.iter().filter_map(|scores| pick(scores)).collect::<Vec<_>>())
+    };
     let finite: Vec<f64> = frames.iter().filter_map(|f| f.psnr).collect();
     Scores {
         frames: frames.len(),
         psnr: mean(&finite),
-        psnr_covisible: mean(&frames.iter().filter_map(|f| f.psnr_covisible).collect::<Vec<_>>()),
-        covisible: mean(&frames.iter().filter_map(|f| f.covisible).collect::<Vec<_>>()),
+        psnr_mean_look: mean_of(|scores| scores.psnr_mean_look),
+        psnr_color_fitted: mean_of(|scores| scores.psnr_color_fitted),
+        psnr_covisible: mean_of(|scores| scores.psnr_covisible),
+        covisible: mean_of(|scores| scores.covisible),
         psnr_infinite: frames.len() - finite.len(),
         ssim: mean(&frames.iter().map(|f| f.ssim).collect::<Vec<_>>()),
         instance: instance_metrics(&of(|confusions| &confusions.labelled)),
@@ -342,6 +359,8 @@ mod tests {
             group: None,
             time: 0.0,
             psnr,
+            psnr_mean_look: psnr.map(|value| value - 1.0),
+            psnr_color_fitted: psnr.map(|value| value + 2.0),
             psnr_covisible: psnr.map(|value| value + 1.0),
             covisible: Some(50.0),
             ssim,
@@ -356,6 +375,7 @@ mod tests {
         let scores = scores_of(frames.iter(), &[]);
         assert_eq!((scores.psnr, scores.psnr_infinite, scores.frames), (Some(25.0), 1, 3));
         assert_eq!((scores.psnr_covisible, scores.covisible), (Some(26.0), Some(50.0)));
+        assert_eq!((scores.psnr_mean_look, scores.psnr_color_fitted), (Some(24.0), Some(27.0)));
         assert!((scores.ssim.unwrap() - 0.8).abs() < 1e-12);
         assert_eq!(scores.instance, InstanceMetrics::default());
     }

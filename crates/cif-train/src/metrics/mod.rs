@@ -3,6 +3,7 @@
 //! | module | answers |
 //! |---|---|
 //! | [`image`] | PSNR and SSIM of one picture |
+//! | `color_fit` | colours fitted to the truth before they are compared |
 //! | [`covisible`] | which pixels of a held-out view training views show too |
 //! | [`instance`] | every instance metric, from per-frame confusion counts |
 //! | [`panoptic`] | the same with what is unlabelled as background |
@@ -12,6 +13,7 @@
 //!
 //! A metric without anything to measure is `None` (`n/a`), never 0 or 100.
 
+mod color_fit;
 pub mod covisible;
 pub mod evaluate;
 pub mod fit;

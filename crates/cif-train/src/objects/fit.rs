@@ -173,7 +173,7 @@ impl<'a> Fit<'a> {
 
     /// Reductions that steps take, coarse to fine, as places in the crops of a view.
     pub(super) fn levels(&self) -> &'static [usize] {
-        let mut areas: Vec<f64> = self.views.iter().map(ObjectView::area).collect();
+        let mut areas: Vec<f64> = self.views.iter().map(ObjectView::detail).collect();
         match super::view::median(&mut areas) {
             area if area > 600.0 => &[2, 1, 0],
             area if area > 120.0 => &[1, 0],

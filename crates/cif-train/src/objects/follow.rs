@@ -6,7 +6,7 @@ use glam::{DQuat, DVec3};
 use rand::RngExt;
 use rayon::prelude::*;
 
-use super::fit::{Fit, fresh_moments, hull, log};
+use super::fit::{Fit, PoseMoments, fresh_moments, hull, log};
 use super::shape::Pose;
 use crate::error::TrainError;
 use crate::phases::Phases;
@@ -185,22 +185,25 @@ fn found(fit: &Fit<'_>, time: usize, path: &BTreeMap<usize, DVec3>, views: &[usi
         tried.extend(judge(candidates.collect()).iter().take(KEPT).map(|(_, at)| *at));
     }
     let steps = if known.len() > 1 { POSE } else { 2 * POSE };
-    let refined = tried.into_par_iter().map_init(
-        || fit.shape.copied(),
-        |shape, at| {
-            let mut pose = posed(at);
-            let mut moments = fresh_moments();
-            for level in levels {
-                let rate = if *level > 0 || levels.len() == 1 { 1.0 } else { 0.5 };
+    let mut refined: Vec<(f64, Pose, PoseMoments)> =
+        tried.into_iter().map(|at| (0.0, posed(at), fresh_moments())).collect();
+    for level in levels {
+        let rate = if *level > 0 || levels.len() == 1 { 1.0 } else { 0.5 };
+        let moved = refined.into_par_iter().map_init(
+            || fit.shape.copied(),
+            |shape, (_, mut pose, mut moments)| {
                 for step in 0..steps {
                     let view = views[step % views.len()];
                     fit.pose_step(shape, view, *level, (&mut pose, &mut moments), rate);
                 }
-            }
-            let loss: f64 = views.iter().map(|view| fit.loss_with(shape, *view, 0, &pose)).sum();
-            (loss, pose)
-        },
-    );
-    let refined: Vec<(f64, Pose)> = refined.collect();
-    refined.into_iter().min_by(|a, b| a.0.total_cmp(&b.0)).map_or(last, |(_, pose)| pose)
+                let loss = views.iter().map(|view| fit.loss_with(shape, *view, *level, &pose)).sum();
+                (loss, pose, moments)
+            },
+        );
+        refined = moved.collect();
+        refined.sort_by(|a, b| a.0.total_cmp(&b.0));
+        // Few pixels tell which are worth more of them.
+        refined.truncate(refined.len().div_ceil(2));
+    }
+    refined.first().map_or(last, |(_, pose, _)| *pose)
 }

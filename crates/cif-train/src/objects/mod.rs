@@ -170,13 +170,16 @@ fn views_of(
 ) -> Result<Vec<ObjectView>, TrainError> {
     let behind = surroundings.order.behind(label);
     let masks = frames.masks(dataset, surroundings.phases)?;
+    let areas = masks.iter().flatten().filter_map(|table| Some(f64::from(table.rows.get(&label)?.pixels)));
+    let joined = view::joined(areas.collect());
     let mut views = Vec::new();
     for (k, table) in masks.iter().enumerate() {
         surroundings.phases.check()?;
         let Some(table) = table.as_ref().filter(|table| table.rows.contains_key(&label)) else { continue };
         let frame = &dataset.frames[frames.index(k)];
         let data = frames.get(dataset, k)?;
-        views.extend(ObjectView::new((label, &behind), frame.time_index, &frame.camera, &data, table));
+        let seen = (&data, joined);
+        views.extend(ObjectView::new((label, &behind), frame.time_index, &frame.camera, seen, table));
     }
     views.sort_by_key(|view| view.time_index);
     view::set_visible(&mut views);

@@ -119,7 +119,7 @@ pub(super) fn views_in_masks(
         let bytes = image.color.map(|c| c.map(|c| (255.0 * c.clamp(0.0, 1.0)).round() as u8));
         let table = MaskTable::of(&labels);
         let frame = Arc::new(TrainFrame { image: bytes, labels: Some(labels), labelled: 0, features: None });
-        views.extend(ObjectView::new((1, &behind), k, &camera, &frame, &table));
+        views.extend(ObjectView::new((1, &behind), k, &camera, (&frame, 1), &table));
     }
     set_visible(&mut views);
     views

@@ -18,6 +18,10 @@ const MARGIN: u32 = 5;
 /// Masks of fewer pixels say nothing.
 const FEWEST_PIXELS: u32 = 12;
 
+/// Pixels of the mask of an object, in the median of its views, up to which these are looked at as they are: of larger
+/// ones pixels are joined, since one across is less than 2 % of the object then and fits take as long as they have pixels.
+const MOST_PIXELS: f64 = 3000.0;
+
 /// Share of a reduced pixel that the mask must have for its colour to count.
 const COLOR_SHARE: f32 = 0.3;
 
@@ -69,8 +73,10 @@ pub(super) struct ObjectView {
     pub(super) touched: f64,
     /// Visible share: area over the median area of the nearest whole masks, at most 1.
     pub(super) visible: f64,
-    /// By reduction: 1, 2, 4.
+    /// By reduction: 1, 2, 4 of the finest.
     pub(super) crops: [Crop; 3],
+    /// Pixels of the image across one of the finest crop.
+    joined: u32,
     label: u16,
     /// By label, true for those that cannot hide it.
     behind: Arc<[bool]>,
@@ -91,13 +97,13 @@ pub(super) enum Seen {
 }
 
 impl ObjectView {
-    /// The view of a label (dense index + 1), with the labels that are behind it, in a frame with its masks; `None`
-    /// where these show too little of it.
+    /// The view of a label (dense index + 1), with the labels that are behind it, in a frame with its masks, so many of its
+    /// pixels joined to one of the finest crop across; `None` where the masks show too little of it.
     pub(super) fn new(
         (label, behind): (u16, &Arc<[bool]>),
         time_index: usize,
         camera: &PinholeCamera,
-        frame: &Arc<TrainFrame>,
+        (frame, joined): (&Arc<TrainFrame>, u32),
         table: &MaskTable,
     ) -> Option<Self> {
         let (labels, colors) = (frame.labels.as_ref()?, &frame.image);
@@ -119,7 +125,9 @@ impl ObjectView {
             cut: row.is_cut(),
             touched: f64::from(touching) / f64::from(ring.max(1)),
             visible: 1.0,
-            crops: [1, 2, 4].map(|factor| crop(factor, (label, behind), camera, (low, high), labels, colors)),
+            crops: [1, 2, 4]
+                .map(|more| crop(joined * more, (label, behind), camera, (low, high), labels, colors)),
+            joined,
             pixels,
             label,
             behind: Arc::clone(behind),
@@ -127,8 +135,14 @@ impl ObjectView {
         })
     }
 
+    /// Pixels of the mask in the image.
     pub(super) fn area(&self) -> f64 {
         self.pixels.len() as f64
+    }
+
+    /// Pixels of the mask in the finest crop.
+    pub(super) fn detail(&self) -> f64 {
+        self.area() / f64::from(self.joined * self.joined)
     }
 
     /// Distance from the middle of the mask, pixels, within which this share of it lies.
@@ -194,6 +208,13 @@ impl ObjectView {
             _ => Seen::Other,
         }
     }
+}
+
+/// Pixels of images across one of the finest crops of an object, by the pixels of its masks.
+pub(super) fn joined(mut areas: Vec<f64>) -> u32 {
+    let area = median(&mut areas);
+    let wide_enough = |joined: &u32| area <= MOST_PIXELS * f64::from(joined * joined);
+    (0..u32::BITS / 2).map(|k| 1 << k).find(wide_enough).unwrap_or(1)
 }
 
 /// True for a label that cannot hide the object: what nobody labelled, or what lies behind it.

@@ -23,6 +23,8 @@ pub enum EffectKind {
     Objects,
     /// Exposure and white balance per camera.
     Exposure,
+    /// Exposure and white balance per training image.
+    ExposureInTime,
     /// Compensation of opacity for the low-pass filter.
     Antialiasing,
     /// Removal of lens distortion.
@@ -35,7 +37,7 @@ pub enum EffectKind {
 
 impl EffectKind {
     /// Those that `--effects` switches.
-    pub const SWITCHED: [Self; 10] = [
+    pub const SWITCHED: [Self; 11] = [
         Self::Motion,
         Self::Shape,
         Self::ViewDependence,
@@ -44,6 +46,7 @@ impl EffectKind {
         Self::Guidance,
         Self::Objects,
         Self::Exposure,
+        Self::ExposureInTime,
         Self::Antialiasing,
         Self::Physics,
     ];
@@ -61,6 +64,7 @@ impl EffectKind {
             Self::Guidance => "guidance",
             Self::Objects => "objects",
             Self::Exposure => "exposure",
+            Self::ExposureInTime => "exposure-in-time",
             Self::Antialiasing => "antialiasing",
             Self::Lens => "lens",
             Self::Background => "background",

@@ -2,12 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use cif_dataset::{Dataset, Frame, PointSource, Split};
+use cif_dataset::{Dataset, Frame, Split};
 use glam::DVec3;
 use rayon::prelude::*;
 
 use crate::config::MotionConfig;
 use crate::error::TrainError;
+use crate::exposure::{Brightness, known_points};
 use crate::mask_table::MaskTable;
 use crate::phase::Phase;
 use crate::phases::Phases;
@@ -30,16 +31,10 @@ const CHANGE: u8 = 24;
 /// Initial points that distances are measured with.
 const POINTS: usize = 500;
 
-/// Points, cameras, and images of each that brightness is compared with.
-const COLORED_POINTS: usize = 4_000;
+/// Cameras whose brightness is compared, and images of each, and of a camera that is the only one.
 const EXPOSED_CAMERAS: usize = 24;
 const EXPOSED_IMAGES: usize = 3;
-
-/// Values that cameras record in proportion to the light.
-const PROPORTIONAL: std::ops::RangeInclusive<u8> = 24..=232;
-
-/// Points with such values, per channel, that a camera is judged by.
-const SAMPLES: usize = 60;
+const EXPOSED_IMAGES_OF_ONE: usize = 24;
 
 /// Evidence found in a capture.
 #[derive(Clone, Debug, PartialEq)]
@@ -60,9 +55,8 @@ pub(super) struct Evidence {
     pub travelling: Vec<String>,
     /// Labels of the instances that appear or vanish inside the view, by their masks.
     pub appearing: Vec<String>,
-    /// Training cameras that were compared, and the largest factor between two of them in how bright they record
-    /// the same points, by channel; `None` with fewer than two cameras, or points without colours.
-    pub exposures: Option<(usize, f64)>,
+    /// How bright training cameras record the same points; `None` where no points have colours.
+    pub exposures: Option<Exposures>,
     /// Largest over smallest number of pixels per metre at the points that frames see, by frame.
     pub footprint_ratio: f64,
     /// Largest angle between directions from which training cameras see the middle of the points, degrees.
@@ -71,6 +65,17 @@ pub(super) struct Evidence {
     pub lenses: usize,
     /// True when images carry alpha.
     pub has_alpha: bool,
+}
+
+/// How bright training cameras record the same points.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Exposures {
+    /// Cameras that were compared.
+    pub cameras: usize,
+    /// Largest factor between two of them, by channel.
+    pub between_cameras: f64,
+    /// The same between two times of one camera; `None` where no camera has several.
+    pub in_time: Option<f64>,
 }
 
 impl Evidence {
@@ -201,53 +206,47 @@ fn labels(dataset: &Dataset, wanted: impl Fn(u16) -> bool) -> Vec<String> {
     instances.map(|instance| instance.label.clone()).collect()
 }
 
-/// Number of training cameras that could be compared, and the largest factor between two of them in how bright they
-/// record the same points.
+/// Compared training cameras, and how bright they record the same points.
 fn exposures(
     dataset: &Dataset,
     cameras: &BTreeMap<&str, Vec<(usize, &Frame)>>,
     phases: &Phases,
-) -> Result<Option<(usize, f64)>, TrainError> {
-    if cameras.len() < 2 || matches!(dataset.points.source, PointSource::Random) {
+) -> Result<Option<Exposures>, TrainError> {
+    let points = known_points(dataset);
+    if points.is_empty() {
         return Ok(None);
     }
-    let points: Vec<([f32; 3], [u8; 3])> =
-        dataset.points.positions.iter().copied().zip(dataset.points.colors.iter().copied()).collect();
-    let points = spread(&points, COLORED_POINTS);
-    let (mut low, mut high, mut compared) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3], 0);
+    let (mut of_cameras, mut drift) = (Vec::new(), None::<f64>);
     for frames in spread(&cameras.values().collect::<Vec<_>>(), EXPOSED_CAMERAS) {
-        let mut ratios: [Vec<f64>; 3] = Default::default();
-        for (index, frame) in spread(frames, EXPOSED_IMAGES) {
+        let wanted = if cameras.len() > 1 { EXPOSED_IMAGES } else { EXPOSED_IMAGES_OF_ONE };
+        let (mut all, mut of_images) = (Brightness::default(), Vec::new());
+        for (index, frame) in spread(frames, wanted) {
             phases.check()?;
-            let image = dataset.load_image(index, [1.0; 3])?;
-            for (position, color) in &points {
-                let Some([x, y]) = frame.camera.pixel_of(DVec3::from(position.map(f64::from))) else {
-                    continue;
-                };
-                let seen = image.at(x, y);
-                for channel in 0..3 {
-                    let pair = [seen[channel], color[channel]];
-                    // Near black and white, cameras do not record in proportion.
-                    if pair.iter().all(|value| PROPORTIONAL.contains(value)) {
-                        let [seen, known] = pair.map(f64::from);
-                        ratios[channel].push((seen / known).ln());
-                    }
-                }
-            }
+            let mut of_image = Brightness::default();
+            of_image.add(&dataset.load_image(index, [1.0; 3])?, &frame.camera, &points);
+            all.append(&of_image);
+            of_images.extend(of_image.medians());
         }
-        if ratios.iter().any(|of| of.len() < SAMPLES) {
-            continue;
-        }
-        compared += 1;
-        for (channel, of) in ratios.iter_mut().enumerate() {
-            // Half of the points may be hidden, shiny or misplaced.
-            of.sort_by(f64::total_cmp);
-            let median = of[of.len() / 2];
-            (low[channel], high[channel]) = (low[channel].min(median), high[channel].max(median));
+        of_cameras.extend(all.medians());
+        // Photographs of one moment have exposures of their own too, but nothing tells those of others.
+        let mut times: Vec<usize> = frames.iter().map(|(_, frame)| frame.time_index).collect();
+        times.sort_unstable();
+        times.dedup();
+        if times.len() == frames.len() && of_images.len() > 1 {
+            drift = Some(drift.unwrap_or(0.0).max(widest(&of_images)));
         }
     }
-    let widest = (0..3).map(|channel| high[channel] - low[channel]).fold(0.0, f64::max);
-    Ok((compared >= 2).then(|| (compared, widest.exp())))
+    let cameras = of_cameras.len();
+    Ok((cameras > 0).then(|| Exposures { cameras, between_cameras: widest(&of_cameras), in_time: drift }))
+}
+
+/// Largest factor between two of several medians of brightness, by channel.
+fn widest(medians: &[[f64; 3]]) -> f64 {
+    let range = |channel: usize| {
+        let of = || medians.iter().map(|medians| medians[channel]);
+        of().fold(f64::NEG_INFINITY, f64::max) - of().fold(f64::INFINITY, f64::min)
+    };
+    (0..3).map(range).fold(0.0, f64::max).exp()
 }
 
 /// Largest over smallest median of pixels per metre at what a frame sees; 1 with nothing to compare.

@@ -128,6 +128,7 @@ fn set(kind: EffectKind, extent: Extent, config: &mut TrainConfig) {
         // Off, it leaves a preset that moves opacities as it is; `shape` judges these.
         EffectKind::Appearing => config.model.heads.opacity |= extent != Extent::Off,
         EffectKind::Exposure => config.effects.exposure = extent != Extent::Off,
+        EffectKind::ExposureInTime => config.effects.exposure_in_time = extent != Extent::Off,
         EffectKind::Physics => config.effects.physics = extent != Extent::Off,
         EffectKind::Antialiasing => config.antialiased = extent != Extent::Off,
         // Told, and set elsewhere: by the number of times, by the capture, by the background.

@@ -1,4 +1,5 @@
 use super::decide::objects;
+use super::evidence::Exposures;
 use super::*;
 use crate::config::ObjectMotion;
 
@@ -19,6 +20,11 @@ fn found() -> Evidence {
         lenses: 0,
         has_alpha: false,
     }
+}
+
+#[expect(clippy::unnecessary_wraps, reason = "as evidence has it")]
+fn exposed(cameras: usize, between_cameras: f64, in_time: Option<f64>) -> Option<Exposures> {
+    Some(Exposures { cameras, between_cameras, in_time })
 }
 
 fn plan(found: &Evidence, choice: &str) -> (EffectPlan, TrainConfig) {
@@ -96,7 +102,7 @@ fn few_directions_and_many_footprints_count() {
 
 #[test]
 fn every_effect_says_why_and_what_decides_otherwise() {
-    let lens = Evidence { lenses: 3, has_alpha: true, exposures: Some((3, 1.02)), ..found() };
+    let lens = Evidence { lenses: 3, has_alpha: true, exposures: exposed(3, 1.02, Some(1.0)), ..found() };
     let (plan, _) = plan(&lens, "auto");
     for effect in &plan.effects {
         assert!(!effect.evidence.is_empty() && !effect.cost.is_empty(), "{effect:?}");
@@ -117,6 +123,7 @@ fn every_effect_says_why_and_what_decides_otherwise() {
             "guidance",
             "objects",
             "exposure",
+            "exposure-in-time",
             "antialiasing",
             "lens",
             "background",
@@ -153,12 +160,12 @@ fn the_motion_that_is_tried_is_told_object_by_object() {
 
 #[test]
 fn cameras_that_disagree_and_instances_that_appear_count() {
-    let calm = Evidence { exposures: Some((8, 1.04)), ..found() };
+    let calm = Evidence { exposures: exposed(8, 1.04, None), ..found() };
     let (plan, config) = plan(&calm, "auto");
     assert_eq!(plan.decision(EffectKind::Exposure), Some(&Decision::Off));
     assert_eq!(plan.decision(EffectKind::Appearing), Some(&Decision::Off));
     assert!(!config.effects.exposure && !config.model.heads.opacity);
-    let found = Evidence { exposures: Some((8, 1.3)), appearing: vec!["kite".to_owned()], ..found() };
+    let found = Evidence { exposures: exposed(8, 1.3, None), appearing: vec!["kite".to_owned()], ..found() };
     let (plan, config) = self::plan(&found, "auto");
     assert!(config.effects.exposure && config.model.heads.opacity);
     assert!(self::plan(&calm, "auto,+appearing").1.model.heads.opacity);
@@ -169,6 +176,21 @@ fn cameras_that_disagree_and_instances_that_appear_count() {
     assert!(!config.effects.exposure && !config.model.heads.opacity);
     assert!(self::plan(&calm, "all,+exposure").1.effects.exposure);
     assert!(self::plan(&self::found(), "+exposure").0.decision(EffectKind::Exposure).is_none(), "one camera");
+}
+
+#[test]
+fn a_camera_that_adapts_while_it_films_has_an_exposure_per_image() {
+    let of = |cameras, drift| Evidence { exposures: exposed(cameras, 1.02, drift), ..found() };
+    for (found, in_time) in [(of(1, Some(1.18)), true), (of(1, Some(1.03)), false), (of(5, Some(1.18)), true)]
+    {
+        let (_, config) = plan(&found, "auto");
+        assert_eq!((config.effects.exposure, config.effects.exposure_in_time), (false, in_time), "{found:?}");
+    }
+    assert!(!plan(&of(1, Some(1.18)), "auto,-exposure-in-time").1.effects.exposure_in_time);
+    assert!(plan(&of(1, Some(1.03)), "auto,+exposure-in-time").1.effects.exposure_in_time);
+    // Photographs of one moment.
+    let (plan, _) = plan(&of(1, None), "auto,+exposure-in-time");
+    assert!(plan.decision(EffectKind::ExposureInTime).is_none());
 }
 
 #[test]

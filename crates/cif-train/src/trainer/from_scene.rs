@@ -11,7 +11,6 @@ use super::resume::{SavedState, inputs_of, restore};
 use super::{Trainer, initialize};
 use crate::config::TrainConfig;
 use crate::error::TrainError;
-use crate::exposure::trained_exposures;
 use crate::phase::Phase;
 use crate::progress::{Progress, Source};
 use crate::stage::Stage;
@@ -97,9 +96,11 @@ impl Trainer {
         if !trainer.stages.has_instances {
             return Err(TrainError::NoLabels { root: trainer.state.dataset.root });
         }
-        let known = trained_exposures(&trainer.state.field);
-        if !trainer.state.config.effects.exposure || trainer.state.progress.exposures.is_none() {
-            trainer.state.progress.exposures = trainer.exposures().map(|fresh| fresh.start_with(&known));
+        let known = trainer.state.field.record.drawing.clone();
+        let effects = &trainer.state.config.effects;
+        let is_learnt = effects.exposure || effects.exposure_in_time;
+        if !is_learnt || trainer.state.progress.exposures.is_none() {
+            trainer.state.progress.exposures = trainer.exposures()?.map(|fresh| fresh.start_with(&known));
         }
         if let Some((mut tensors, steps)) = state {
             restore(&mut trainer.state.optimiser, &mut tensors, &steps)?;

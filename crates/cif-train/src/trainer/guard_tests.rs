@@ -51,7 +51,11 @@ fn a_bad_gradient_of_an_exposure_moves_neither_exposures_nor_field() {
         (state(trainer), exposures)
     };
     let before = arrays(&trainer);
-    trainer.state.progress.exposures.as_mut().unwrap().add("cam1", &[0.0, 0.0, f32::INFINITY, 0.0, 0.0, 0.0]);
+    trainer.state.progress.exposures.as_mut().unwrap().add(
+        "cam1",
+        0.0,
+        &[0.0, 0.0, f32::INFINITY, 0.0, 0.0, 0.0],
+    );
     let (result, events) = step(&mut trainer);
     result.unwrap();
     let [TrainEvent::RolledBack { fault, .. }] = &events[..] else { panic!("{events:?}") };

@@ -210,7 +210,7 @@ impl Trainer {
         trainer.check_told()?;
         let first = trainer.stages.from(&trainer.state.config, Stage::Search);
         trainer.state.progress = Progress::at(first);
-        trainer.state.progress.exposures = trainer.exposures();
+        trainer.state.progress.exposures = trainer.exposures()?;
         trainer.enter(first)?;
         Ok(trainer)
     }
@@ -310,9 +310,16 @@ impl Trainer {
         })
     }
 
-    /// Neutral exposures of the cameras, where they are to be learnt.
-    fn exposures(&self) -> Option<Exposures> {
-        self.state.config.effects.exposure.then(|| Exposures::of(&self.state.dataset)).flatten()
+    /// Exposures to begin with, where they are to be learnt: neutral ones of cameras, and those of single images as points
+    /// show them.
+    fn exposures(&self) -> Result<Option<Exposures>, TrainError> {
+        let State { config, dataset, frames, phases, .. } = &self.state;
+        let in_time = config.effects.exposure_in_time;
+        if !config.effects.exposure && !in_time {
+            return Ok(None);
+        }
+        let Some(exposures) = Exposures::of(dataset, in_time) else { return Ok(None) };
+        Ok(Some(if in_time { exposures.with_measured_gains(dataset, frames, phases)? } else { exposures }))
     }
 
     fn warn_of_capture(&mut self) {

@@ -5,6 +5,7 @@ use serde_json::{Map, Value, json};
 
 use super::Trainer;
 use crate::config::Ablation;
+use crate::exposure::Exposures;
 use crate::stage::Stage;
 
 /// The members of a JSON object that are not null.
@@ -26,13 +27,14 @@ impl Trainer {
         let rollbacks = &progress.rollbacks;
         let rolled_back =
             (!rollbacks.is_empty()).then(|| json!({ "steps": rollbacks.total, "last": rollbacks.last }));
-        let exposures = progress.exposures.iter().flat_map(|exposures| exposures.by_camera());
+        let exposures = progress.exposures.as_ref();
         Record {
             drawing: Drawing {
                 near: Some(self.state.near),
                 antialiased: Some(config.antialiased),
                 opacity_is_occupancy: config.ablates(Ablation::OpacityOccupancy) || self.labels_by_opacity(),
-                exposures: exposures.map(|(camera, exposure)| (camera.to_owned(), exposure)).collect(),
+                exposures: exposures.map(Exposures::by_camera).unwrap_or_default(),
+                exposures_in_time: exposures.map(Exposures::in_time).unwrap_or_default(),
             },
             frame: dataset.frame,
             // Those of the world of the capture, and of its frames.

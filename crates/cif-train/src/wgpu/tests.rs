@@ -158,7 +158,8 @@ fn instance_losses_on(gpu: Gpu) {
 
 /// Exposures of so many cameras, none of them neutral.
 fn some_exposures(cameras: usize) -> Exposures {
-    let mut exposures = Exposures::neutral((0..cameras).map(|k| format!("camera {k:04}")).collect());
+    let mut exposures =
+        Exposures::neutral((0..cameras).map(|k| format!("camera {k:04}")).collect(), Vec::new());
     let values = (0..cameras * WIDTH).map(|k| 0.2 * wave(k, 0.71)).collect();
     let zeros = vec![0.0; cameras * WIDTH];
     (exposures.values, exposures.first, exposures.second) = (values, zeros.clone(), zeros);
@@ -181,7 +182,7 @@ fn exposed_colours_and_their_gradients_are_those_of_the_cpu() {
     // Sums are those in double precision; another view of the camera adds to them.
     let mut expected = [0.0_f64; WIDTH];
     for lambda_dssim in [0.0, 0.2] {
-        let of_camera = cameras.at("camera 0001");
+        let of_camera = cameras.at("camera 0001", 0.0);
         let mut recorded = rendered.clone();
         of_camera.apply(&mut recorded);
         let mut v = PixelGrid::filled(0, 0, [0.0; 3]);
@@ -240,7 +241,7 @@ fn exposures_move_as_on_the_cpu() {
             for camera in (0..cameras).filter(|camera| !(camera + t as usize).is_multiple_of(3)) {
                 let gradient: [f32; WIDTH] =
                     std::array::from_fn(|k| 1e-2 * wave(WIDTH * camera + k, 0.3 + t as f32));
-                cpu.add(&format!("camera {camera:04}"), &gradient);
+                cpu.add(&format!("camera {camera:04}"), 0.0, &gradient);
                 gradients[WIDTH * camera..][..WIDTH].copy_from_slice(&gradient);
             }
             cpu.step(RATES[0]);

@@ -3,7 +3,7 @@
 use crate::support::{
     Scene, capture, relative_gain, small_config, stopped_after, train, with_known_points, without_record,
 };
-use cif_dataset::{Dataset, Split};
+use cif_dataset::{Dataset, Frame, Split};
 use cif_train::exposure::{Exposure, trained_exposures};
 use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
 use cif_train::plan::EffectKind;
@@ -260,6 +260,39 @@ fn exposures_are_learnt_where_cameras_disagree() {
         [config, forced].map(|config| mean_score(&train(agree.clone(), config.clone()), &config));
     println!("cameras agree: {with:.2} dB with exposures, {without:.2} dB without");
     assert!(without > with - 0.3, "{with} dB with exposures, {without} dB without");
+}
+
+#[test]
+fn a_camera_that_adapts_while_it_films_is_told_from_what_it_sees() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = Scene { times: 8, views: 8, one_camera: true, disagree: true, ..Scene::default() };
+    let mut dataset = with_known_points(capture(folder.path(), scene));
+    // What other cameras are elsewhere is one camera here.
+    let of_training = |frame: &&mut Frame| frame.split == Split::Train;
+    dataset.frames.iter_mut().filter(of_training).for_each(|frame| frame.camera_name = "phone".into());
+    let dark = TrainConfig { background: [0.0; 3], ..small_config() };
+    let config = planned(&dataset, &dark, "auto");
+    assert!(config.effects.exposure_in_time && !config.effects.exposure);
+    let (with, without) = (
+        train(dataset.clone(), config.clone()),
+        train(dataset.clone(), planned(&dataset, &config, "auto,-exposure-in-time")),
+    );
+    let (gained, plain) = (score(&with), score(&without));
+    println!("a camera adapts: {gained:.2} dB with exposures, {plain:.2} dB without");
+    assert!(gained > plain + 0.5, "{gained} dB with exposures, {plain} dB without");
+    // One image shows little of what it was exposed by: most of it is found.
+    let drawing = &with.field().record.drawing;
+    let (mut missed, mut all) = (0.0, 0.0);
+    for (view, time) in dataset.times.iter().enumerate() {
+        let Exposure { gain, offset } = drawing.exposure("phone", *time).unwrap();
+        for (channel, truth) in relative_gain(view).into_iter().enumerate() {
+            let of_grey = f64::from(gain[channel] + offset[channel] / 0.5);
+            missed += (of_grey / truth).ln().abs();
+            all += truth.ln().abs();
+        }
+    }
+    assert!(missed < 0.4 * all, "{:.0} % missed", 100.0 * missed / all);
+    assert!(!without.field().record.drawing.has_exposures());
 }
 
 #[test]

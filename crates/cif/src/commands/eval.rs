@@ -207,7 +207,9 @@ fn print_table(evaluation: &Evaluation, field: &Field) {
         let all = evaluation.frames.len();
         println!(
             "{exposed} of {all} frames compared as their camera was learnt to expose, the others as the average \
-             camera sees"
+             camera sees; PSNR of all as the average camera sees {}, with the colours of each fitted {}",
+            number(evaluation.overall.psnr_mean_look, 2),
+            number(evaluation.overall.psnr_color_fitted, 2)
         );
     }
     println!("{} Gaussians, {:.1} ms per frame", evaluation.gaussians, evaluation.render_ms_per_frame);

@@ -71,7 +71,8 @@ impl GpuEngine {
         };
         let frame = &state.dataset.frames[view.index];
         let cameras = state.progress.exposures.as_ref();
-        let camera = cameras.and_then(|all| all.position(&frame.camera_name)).map(|camera| camera as u32);
+        let row = cameras.and_then(|all| all.position(&frame.camera_name, frame.time));
+        let camera = row.map(|row| row as u32);
         let with_instances = plan.trains_instances(view) && resident.identities.is_some();
         let settings =
             RenderSettings { instances: plan.settings.instances.filter(|_| with_instances), ..plan.settings };

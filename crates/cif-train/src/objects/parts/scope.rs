@@ -40,7 +40,7 @@ pub(super) struct Search<'a> {
 impl<'a> Search<'a> {
     /// Reduction at which guesses are compared.
     pub(super) fn level(&self) -> usize {
-        let mut areas: Vec<f64> = self.train.iter().map(|view| self.object.views[*view].area()).collect();
+        let mut areas: Vec<f64> = self.train.iter().map(|view| self.object.views[*view].detail()).collect();
         usize::from(median(&mut areas) > 1500.0)
     }
 

@@ -54,7 +54,7 @@ impl<'a> Evidence<'a> {
     /// The views of an object that show most of it; `None` where they are too few.
     pub(super) fn of(views: &'a [ObjectView]) -> Option<Self> {
         let reliable: Vec<&ObjectView> = views.iter().filter(|view| view.is_reliable()).collect();
-        let mut areas: Vec<f64> = reliable.iter().map(|view| view.area()).collect();
+        let mut areas: Vec<f64> = reliable.iter().map(|view| view.detail()).collect();
         let area = cif_geometry::stats::median(&mut areas)?;
         let level = [1.0, 4.0, 16.0].iter().position(|reduced| area / reduced <= LARGE).unwrap_or(2);
         let mut cameras = BTreeMap::new();

@@ -279,7 +279,9 @@ impl Checker<'_> {
         let mut copy = formats::field_of(&read, &target.path)?;
         let read_s = start.elapsed().as_secs_f64();
         // Of the capture rather than of the scene: no format holds exposures, and viewers choose a background.
-        copy.record.drawing.exposures.clone_from(&self.field.record.drawing.exposures);
+        let drawing = &self.field.record.drawing;
+        copy.record.drawing.exposures.clone_from(&drawing.exposures);
+        copy.record.drawing.exposures_in_time.clone_from(&drawing.exposures_in_time);
         copy.background = self.field.background;
         let codes = &graph.time_codes;
         // Formats of one moment hold no objects either: all of it came back as one.
