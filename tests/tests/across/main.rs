@@ -18,6 +18,7 @@ mod hard_cases;
 mod module_tangles;
 mod objects;
 mod outputs;
+mod recorded_look;
 mod recorded_motion;
 mod reference;
 mod render_memory;

@@ -379,7 +379,8 @@ def evaluate(
     decodes. capture is an opened capture or its folder, which masks (a folder) and downscale (by default as
     the scene was trained) say how to open. split is "val", the held-out frames, or "train".
 
-    The answer has frames (their number), psnr, psnr_covisible and covisible (percent of pixels), ssim,
+    The answer has frames (their number), psnr, psnr_mean_look (without the exposures of cameras), psnr_color_fitted
+    (colours of each image fitted to its truth), psnr_covisible and covisible (percent of pixels), ssim,
     panoptic (quality, segmentation, recognition and iou in percent, pixels without a label being background),
     macc_pix, macc_inst and miou (percent, over labelled pixels), variants (other definitions in use),
     instances (scores of each), groups, per_frame, motion (against known motion, where the capture has it), gaussians,

@@ -75,6 +75,9 @@ pub(super) struct Render {
     /// Quality of the pictures; the loss of a draft is measured on some of the views and printed
     #[arg(long, value_name = "QUALITY", default_value = "final")]
     quality: QualityName,
+    /// Colours as the scene has them, or as the cameras of the capture record them where training learnt their exposures
+    #[arg(long, value_name = "LOOK", default_value = "mean")]
+    look: Look,
     /// Colours of the EXR files
     #[arg(long, value_name = "COLOR", default_value = "linear", requires = "exr")]
     exr_color: ExrColor,
@@ -103,6 +106,15 @@ enum QualityName {
     Draft,
     /// Everything that the scene holds
     Final,
+}
+
+/// Colours of pictures.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Look {
+    /// As the scene has them, which files show too: the mean of what cameras record
+    Mean,
+    /// With the exposure of the camera, between those of the training images before and after
+    Recorded,
 }
 
 /// Colours of EXR files.
@@ -164,6 +176,7 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
             "leave --quality draft or --exr away",
         ));
     }
+    check_look(command, &field)?;
     let mut outputs = Outputs::new(command.force);
     outputs.reads(&command.scene)?;
     command.report.check(&mut outputs)?;
@@ -199,8 +212,16 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     let settings = quality.settings(&settings);
     let clock = SystemClock::start();
     let start = clock.now();
-    for (index, Shot { view, .. }) in views.iter().enumerate() {
+    for (index, Shot { view, camera }) in views.iter().enumerate() {
         let time = time_of_all.or(view.time).unwrap_or(0.0);
+        let is_recorded = command.look == Look::Recorded;
+        let exposure = is_recorded.then(|| field.record.drawing.exposure(camera, time)).flatten();
+        let recorded = |mut image: RenderedImage| {
+            if let Some(exposure) = exposure {
+                exposure.apply(&mut image.color);
+            }
+            image
+        };
         let lines = trajectories.as_ref().map(|paths| paths.lines(&view.camera, time)).unwrap_or_default();
         let mut files = ViewFiles::create(&what, &field, &command.output, view, lines)?;
         match &mut painter {
@@ -212,14 +233,14 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
                 let request = BandRequest { channels, ..BandRequest::default() };
                 renderer.render_bands(&field, &view.camera, time, &settings, &request, |band| {
                     interrupt::go_on()?;
-                    files.add(&band.image)
+                    files.add(&recorded(band.image))
                 })?;
             }
             #[cfg(feature = "wgpu")]
             Painter::Gpu(renderer) => {
                 renderer.render_bands(&field, &view.camera, time, &settings, channels, |_, band| {
                     interrupt::go_on()?;
-                    files.add(&band)
+                    files.add(&recorded(band))
                 })?;
             }
         }
@@ -231,6 +252,29 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
         what.iter().map(|what| what.folder()).chain(command.exr.then(|| EXR_FOLDER.to_owned())).collect();
     let report = report(&layers, &views, time_of_all, command, seconds)?;
     command.report.give(|| report, || {})
+}
+
+/// Refuses a recorded look that nothing is known of, or that files for compositors do not have.
+fn check_look(command: &Render, field: &Field) -> Result<(), Error> {
+    if command.look == Look::Mean {
+        return Ok(());
+    }
+    if command.exr || command.capture.is_none() {
+        return Err(Error::usage(
+            "--look recorded is that of a camera of a capture, in pictures; EXR files hold the mean look",
+            "give --capture, and leave --exr out",
+        ));
+    }
+    if !field.record.drawing.has_exposures() {
+        return Err(Error::failed(
+            format!(
+                "{}: training learnt no exposures, so that all cameras record the mean look",
+                command.scene.display()
+            ),
+            "leave --look recorded out; cif plan says what a capture calls for",
+        ));
+    }
+    Ok(())
 }
 
 fn pixels(camera: &PinholeCamera) -> u64 {
