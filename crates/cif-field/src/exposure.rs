@@ -47,6 +47,18 @@ impl Exposure {
     /// The exposure that changes nothing.
     pub const NEUTRAL: Self = Self { gain: [1.0; 3], offset: [0.0; 3] };
 
+    /// An exposure that makes all colours brighter by a number of stops, which double them each.
+    #[must_use]
+    pub fn of_stops(stops: f64) -> Self {
+        Self { gain: [stops.exp2() as f32; 3], ..Self::NEUTRAL }
+    }
+
+    /// How much brighter it makes colours, stops: the mean of the channels, whose offsets count for nothing.
+    #[must_use]
+    pub fn stops(&self) -> f64 {
+        self.gain.map(|gain| f64::from(gain.max(f32::MIN_POSITIVE)).log2()).iter().sum::<f64>() / 3.0
+    }
+
     /// Colours as the camera records them.
     pub fn apply(&self, colors: &mut PixelGrid<[f32; 3]>) {
         for pixel in &mut colors.pixels {
@@ -96,5 +108,11 @@ mod tests {
         assert_eq!(TimedExposure::at(&series, 0.25).unwrap().offset, [1.5; 3]);
         assert_eq!(TimedExposure::at(&series[..1], 0.7), Some(series[0].exposure));
         assert_eq!(TimedExposure::at(&[], 0.7), None);
+    }
+
+    #[test]
+    fn stops_double_colours() {
+        assert_eq!(Exposure::of_stops(1.0).gain, [2.0; 3]);
+        assert!((Exposure { gain: [4.0, 1.0, 2.0], offset: [0.5; 3] }.stops() - 1.0).abs() < 1e-6);
     }
 }

@@ -286,6 +286,7 @@ fn camera(numbers: &mut Numbers, label: &str, codes: &[f64], moves: bool) -> Cam
         }
         CameraSample {
             time_code,
+            exposure: 0.0,
             camera: PinholeCamera {
                 width: 640,
                 height: 480,

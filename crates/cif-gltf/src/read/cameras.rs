@@ -114,6 +114,7 @@ fn samples(reader: &Reader<'_>, chain: &Chain, views: &Views) -> Vec<CameraSampl
         let pose = stage.at(chain, stage.clock.seconds(time_code))?;
         Some(CameraSample {
             time_code,
+            exposure: 0.0,
             camera: PinholeCamera {
                 width: view.width,
                 height: view.height,

@@ -159,7 +159,7 @@ mod tests {
         CameraTrack {
             name: "a".into(),
             label: "a".into(),
-            samples: vec![CameraSample { time_code: 0.0, camera }],
+            samples: vec![CameraSample { time_code: 0.0, camera, exposure: 0.0 }],
         }
     }
 

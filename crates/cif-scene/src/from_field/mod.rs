@@ -8,7 +8,7 @@ pub(crate) mod node;
 
 use std::collections::BTreeSet;
 
-use cif_field::{Field, Gaussians};
+use cif_field::{Field, Gaussians, RecordedCamera};
 use cif_geometry::quaternion;
 use cif_geometry::scalar::direct_sigmoid;
 use glam::DVec3;
@@ -108,7 +108,11 @@ pub fn build_from(
     node::measure(&mut nodes, &groups, &mut frames_of, &time_codes.samples);
     let code_of =
         |index: usize| (frames[0]..=frames[frames.len() - 1]).contains(&index).then(|| codes[index]);
-    let cameras = camera_tracks::camera_tracks(&field.cameras, code_of);
+    let exposure_of = |recorded: &RecordedCamera| {
+        let time = field.timeline.times[recorded.time_index];
+        field.record.drawing.exposure(&recorded.name, time).map_or(0.0, |exposure| exposure.stops())
+    };
+    let cameras = camera_tracks::camera_tracks(&field.cameras, code_of, exposure_of);
     let antialiased = field.record.drawing.antialiased.unwrap_or_default();
     let blur = options.bake_blur.then(|| Blur::of(&cameras, antialiased)).flatten();
     if options.bake_blur && blur.is_none() {

@@ -20,4 +20,6 @@ pub struct CameraSample {
     pub time_code: f64,
     /// The view.
     pub camera: PinholeCamera,
+    /// How much brighter than the scene has them it records colours, stops.
+    pub exposure: f64,
 }

@@ -1,17 +1,19 @@
 //! Recorded cameras, and the extent that they span.
 
-use cif_field::{Gaussians, RecordedCamera};
+use std::collections::BTreeMap;
+
+use cif_field::{Exposure, Gaussians, RecordedCamera, TimedExposure};
 use cif_geometry::Bounds;
 use glam::DVec3;
 
-use crate::CameraTrack;
 use crate::motion::time_map::TimeMap;
+use crate::{CameraSample, CameraTrack};
 
 /// Views of all tracks, one per frame and track.
 pub(super) fn cameras(tracks: &[CameraTrack], times: &TimeMap) -> Vec<RecordedCamera> {
     let mut cameras: Vec<RecordedCamera> = Vec::new();
     for track in tracks {
-        let name = if track.label.is_empty() { &track.name } else { &track.label };
+        let name = name_of(track);
         let mut previous = None;
         for sample in &track.samples {
             let time_index = times.nearest_frame(sample.time_code);
@@ -22,6 +24,22 @@ pub(super) fn cameras(tracks: &[CameraTrack], times: &TimeMap) -> Vec<RecordedCa
         }
     }
     cameras
+}
+
+/// Exposures of the tracks whose cameras record colours otherwise than the scene has them, by the name of the camera.
+pub(super) fn exposures(tracks: &[CameraTrack], times: &TimeMap) -> BTreeMap<String, Vec<TimedExposure>> {
+    let adapts = |track: &&CameraTrack| track.samples.iter().any(|sample| sample.exposure != 0.0);
+    let timed = |sample: &CameraSample| TimedExposure {
+        time: times.time(sample.time_code),
+        exposure: Exposure::of_stops(sample.exposure),
+    };
+    let of = |track: &CameraTrack| (name_of(track).clone(), track.samples.iter().map(timed).collect());
+    tracks.iter().filter(adapts).map(of).collect()
+}
+
+/// Name in the capture, or of the prim.
+fn name_of(track: &CameraTrack) -> &String {
+    if track.label.is_empty() { &track.name } else { &track.label }
 }
 
 /// Scene extent: from the cameras as in training, else half the box of the centres.

@@ -24,7 +24,7 @@ use cif_field::{Declared, Drawing, Field, FrameCodes, Gaussians, Identities, Rec
 use crate::SceneError;
 use crate::graph::{NodeKind, SceneGraph};
 use crate::motion::time_map::TimeMap;
-use cameras::{cameras, extent};
+use cameras::{cameras, exposures, extent};
 pub(crate) use check::check;
 pub(crate) use identities::InstanceTable;
 use identities::{embeddings, push_identities};
@@ -96,7 +96,11 @@ pub fn field_from_graph(graph: &SceneGraph, source: &str) -> Result<Field, Scene
         background: graph.background_color.map(|channel| channel.clamp(0.0, 1.0)),
         sort_metric: graph.sort_metric,
         record: Record {
-            drawing: Drawing { antialiased: graph.antialiased, ..Drawing::default() },
+            drawing: Drawing {
+                antialiased: graph.antialiased,
+                exposures_in_time: exposures(&graph.cameras, &times),
+                ..Drawing::default()
+            },
             frame: graph.frame,
             declared: Some(Declared { up_axis: graph.up_axis, meters_per_unit: graph.meters_per_unit }),
             frame_codes: FrameCodes::of(times.codes()),

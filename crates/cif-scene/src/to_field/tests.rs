@@ -1,5 +1,5 @@
-use cif_field::JointKind;
 use cif_field::tracks::{Joint, TrackGroup};
+use cif_field::{Exposure, JointKind, TimedExposure};
 use cif_geometry::spherical_harmonics::HarmonicsRotation;
 use cif_geometry::{Bounds, RigidTransform};
 use glam::{DQuat, DVec3};
@@ -353,5 +353,34 @@ fn joints_leave_with_their_parts_and_come_back() {
         assert!((joint.axis.length() - 1.0).abs() < 1e-9);
         let last = values[values.len() - 1];
         assert!((last - most).abs() < 1e-6, "{kind}: {last}, not {most}");
+    }
+}
+
+#[test]
+fn cameras_that_adapt_come_back_with_their_exposures() {
+    let mut field = recorded_field(2, 5);
+    let name = field.cameras[0].name.clone();
+    let times: Vec<f64> = field.timeline.times.clone();
+    let timed = |(k, time): (usize, &f64)| TimedExposure {
+        time: *time,
+        exposure: Exposure::of_stops(0.1 * k as f64 - 0.2),
+    };
+    let series: Vec<TimedExposure> = times.iter().enumerate().map(timed).collect();
+    field.record.drawing.exposures_in_time.insert(name.clone(), series.clone());
+    let graph = build(&field, &options()).unwrap();
+    let track = graph.cameras.iter().find(|track| track.label == name).unwrap();
+    assert!(track.samples.iter().any(|sample| (sample.exposure + 0.2).abs() < 1e-6), "{track:?}");
+    assert!(
+        graph
+            .cameras
+            .iter()
+            .filter(|track| track.label != name)
+            .all(|track| track.samples[0].exposure == 0.0)
+    );
+    let back = field_from_graph(&graph, "a.usda").unwrap();
+    for sample in &track.samples {
+        let time = time_in_field(&graph, sample.time_code).unwrap();
+        let found = back.record.drawing.exposure(&name, time).unwrap();
+        assert!((found.stops() - sample.exposure).abs() < 1e-6, "{found:?} for {}", sample.exposure);
     }
 }

@@ -209,8 +209,7 @@ impl<'a> Contest<'a> {
     /// True where the images show the turns of poses, and not those of any way that differs.
     fn shows(&self, poses: &Course) -> bool {
         let (paths, seen) = (&self.paths, (self.object.views, self.object.outline.size()));
-        let rivals = if paths.shifts() { paths.ways() } else { paths.spins() };
-        let rivals = rivals.into_iter().map(|way| paths.poses(way));
+        let rivals = paths.ways().into_iter().chain(paths.spins()).map(|way| paths.poses(way));
         match shown(seen, poses, paths.poses(Way::Slide(0)), rivals) {
             Some(Shown::Turn) => true,
             Some(Shown::NoTurn) => !paths.may_roll(),

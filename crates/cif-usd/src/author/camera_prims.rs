@@ -57,6 +57,14 @@ pub(super) fn author(
             }
         }
     }
+    // Of the colours that the scene has.
+    let exposures: Vec<f64> = track.samples.iter().map(|sample| sample.exposure).collect();
+    if exposures.iter().any(|stops| *stops != 0.0) {
+        let attribute = prim.set("exposure", "Float", VARYING, exposures[0])?;
+        for (sample, stops) in track.samples.iter().zip(&exposures).filter(|_| exposures.len() > 1) {
+            attribute.sample(sample.time_code, *stops)?;
+        }
+    }
     let clipping = first.1.clipping_range;
     let clipping = pxr.gf.call_method1("Vec2f", (clipping.x, clipping.y))?;
     prim.set("clippingRange", "Float2", VARYING, clipping)?;

@@ -22,6 +22,9 @@ const LENS: [(&str, f64); 5] = [
     ("verticalApertureOffset", 0.0),
 ];
 
+/// How much brighter than the scene is the camera records colours, stops.
+const EXPOSURE: &str = "exposure";
+
 /// The camera; `None` where it is no perspective camera or its lens makes no sense.
 pub(super) fn read<'py>(
     reading: &Reading<'_, 'py>,
@@ -42,7 +45,7 @@ pub(super) fn read<'py>(
         Some(codes) => codes.try_iter()?.map(|code| code?.extract()).collect::<PyResult<_>>()?,
         None => track.samples.iter().map(|sample| sample.time_code).collect(),
     };
-    for (name, _) in LENS {
+    for name in LENS.iter().map(|(name, _)| *name).chain([EXPOSURE]) {
         if let Some(attribute) = attribute(prim, name)? {
             times.extend(samples(&attribute)?);
         }
@@ -77,7 +80,8 @@ pub(super) fn read<'py>(
             clipping_range: clipping.map_or(DVec2::new(1.0, 1e6), DVec2::from_array),
         };
         let camera = camera(&usd, width.unwrap_or(WIDTH) as u32, height.map(|height| height as u32));
-        views.push(CameraSample { time_code, camera });
+        let exposure = plain::<f64>(prim, EXPOSURE, &at)?.filter(|stops| stops.is_finite()).unwrap_or(0.0);
+        views.push(CameraSample { time_code, camera, exposure });
     }
     let label = text(&prim.call_method0("GetDisplayName")?)?;
     let name = labels::node_name(prim)?;

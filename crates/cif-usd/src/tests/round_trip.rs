@@ -26,6 +26,7 @@ fn assert_same(read: &SceneGraph, written: &SceneGraph) {
         assert_eq!((&a.name, &a.label, a.samples.len()), (&b.name, &b.label, b.samples.len()));
         for (a, b) in a.samples.iter().zip(&b.samples) {
             assert_eq!(a.time_code, b.time_code);
+            assert!((a.exposure - b.exposure).abs() < 1e-6, "{} {}", a.exposure, b.exposure);
             let (a, b) = (&a.camera, &b.camera);
             assert_eq!((a.width, a.height), (b.width, b.height));
             assert!((a.focal_px - b.focal_px).length() < 1e-4, "{a:?} {b:?}");

@@ -299,6 +299,8 @@ impl Maker {
         let first = self.vector();
         let samples = self.codes.clone().into_iter().map(|time_code| CameraSample {
             time_code,
+            // One adapts while it films, the other does not.
+            exposure: if moves { 0.25 - time_code / 64.0 } else { 0.0 },
             camera: PinholeCamera {
                 width: 64,
                 height: 48,
