@@ -10,11 +10,8 @@ use cif_dataset::{Dataset, Split};
 use cif_field::{Drawing, Field, TimedExposure};
 use serde::{Deserialize, Serialize};
 
-pub(crate) use self::brightness::{Brightness, known_points};
+pub(crate) use self::brightness::{Brightness, Recorded, known_points};
 use crate::adam::{Moments, RowRates};
-use crate::error::TrainError;
-use crate::frames::FrameStore;
-use crate::phases::Phases;
 
 pub use cif_field::Exposure;
 
@@ -72,31 +69,12 @@ impl Exposures {
         }
     }
 
-    /// The same with gains by which images record the points of the capture brighter than others do.
-    ///
-    /// # Errors
-    /// When a frame cannot be read, or the run is to stop.
-    pub(crate) fn with_measured_gains(
-        mut self,
-        dataset: &Dataset,
-        frames: &FrameStore,
-        phases: &Phases,
-    ) -> Result<Self, TrainError> {
-        let points = known_points(dataset);
-        for view in 0..frames.len() {
-            phases.check()?;
-            let frame = &dataset.frames[frames.index(view)];
-            let mut brightness = Brightness::default();
-            brightness.add(&frames.get(dataset, view)?.image, &frame.camera, &points);
-            let found = self.position(&frame.camera_name, frame.time).zip(brightness.medians());
-            if let Some((row, medians)) = found {
-                for (value, median) in self.values[WIDTH * row..].iter_mut().zip(medians) {
-                    *value = median as f32;
-                }
-            }
+    /// Begins the row of a camera at a time with logarithms of gains.
+    pub(crate) fn begin_with(&mut self, camera: &str, time: f64, gains: [f64; 3]) {
+        let Some(row) = self.position(camera, time) else { return };
+        for (value, gain) in self.values[WIDTH * row..].iter_mut().zip(gains) {
+            *value = gain as f32;
         }
-        self.take_off_common();
-        Ok(self)
     }
 
     /// True where rows ascend and all have finite values and moments: what was read may be anything.
@@ -209,7 +187,7 @@ impl Exposures {
     }
 
     /// Takes off what all rows have in common: that is the field's.
-    fn take_off_common(&mut self) {
+    pub(crate) fn take_off_common(&mut self) {
         let rows = self.cameras.len() as f32;
         for of in 0..WIDTH {
             let mean = self.values.iter().skip(of).step_by(WIDTH).sum::<f32>() / rows;

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::config::MotionConfig;
 use crate::error::TrainError;
-use crate::exposure::{Brightness, known_points};
+use crate::exposure::{Brightness, Recorded, known_points};
 use crate::mask_table::MaskTable;
 use crate::phase::Phase;
 use crate::phases::Phases;
@@ -219,28 +219,28 @@ fn exposures(
     let (mut of_cameras, mut drift) = (Vec::new(), None::<f64>);
     for frames in spread(&cameras.values().collect::<Vec<_>>(), EXPOSED_CAMERAS) {
         let wanted = if cameras.len() > 1 { EXPOSED_IMAGES } else { EXPOSED_IMAGES_OF_ONE };
-        let (mut all, mut of_images) = (Brightness::default(), Vec::new());
+        let (mut all, mut recorded) = (Brightness::default(), Recorded::of(&points));
         for (index, frame) in spread(frames, wanted) {
             phases.check()?;
-            let mut of_image = Brightness::default();
-            of_image.add(&dataset.load_image(index, [1.0; 3])?, &frame.camera, &points);
-            all.append(&of_image);
-            of_images.extend(of_image.medians());
+            let image = dataset.load_image(index, [1.0; 3])?;
+            all.add(&image, &frame.camera, &points);
+            recorded.add(&image, &frame.camera);
         }
         of_cameras.extend(all.medians());
         // Photographs of one moment have exposures of their own too, but nothing tells those of others.
         let mut times: Vec<usize> = frames.iter().map(|(_, frame)| frame.time_index).collect();
         times.sort_unstable();
         times.dedup();
-        if times.len() == frames.len() && of_images.len() > 1 {
-            drift = Some(drift.unwrap_or(0.0).max(widest(&of_images)));
+        let gains: Vec<[f64; 3]> = recorded.gains().into_iter().flatten().collect();
+        if times.len() == frames.len() && gains.len() > 1 {
+            drift = Some(drift.unwrap_or(0.0).max(widest(&gains)));
         }
     }
     let cameras = of_cameras.len();
     Ok((cameras > 0).then(|| Exposures { cameras, between_cameras: widest(&of_cameras), in_time: drift }))
 }
 
-/// Largest factor between two of several medians of brightness, by channel.
+/// Largest factor between two of several logarithms of brightness, by channel.
 fn widest(medians: &[[f64; 3]]) -> f64 {
     let range = |channel: usize| {
         let of = || medians.iter().map(|medians| medians[channel]);

@@ -93,7 +93,7 @@ use crate::engine::Engine;
 use crate::engine::processor::Processor;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
-use crate::exposure::Exposures;
+use crate::exposure::{Brightness, Exposures, known_points};
 use crate::frames::FrameStore;
 use crate::guidance::Guidance;
 use crate::heads::{Head, HeadTensors, configured};
@@ -318,8 +318,21 @@ impl Trainer {
         if !config.effects.exposure && !in_time {
             return Ok(None);
         }
-        let Some(exposures) = Exposures::of(dataset, in_time) else { return Ok(None) };
-        Ok(Some(if in_time { exposures.with_measured_gains(dataset, frames, phases)? } else { exposures }))
+        let Some(mut exposures) = Exposures::of(dataset, in_time) else { return Ok(None) };
+        if in_time {
+            let points = known_points(dataset);
+            for view in 0..frames.len() {
+                phases.check()?;
+                let frame = &dataset.frames[frames.index(view)];
+                let mut brightness = Brightness::default();
+                brightness.add(&frames.get(dataset, view)?.image, &frame.camera, &points);
+                if let Some(gains) = brightness.medians() {
+                    exposures.begin_with(&frame.camera_name, frame.time, gains);
+                }
+            }
+            exposures.take_off_common();
+        }
+        Ok(Some(exposures))
     }
 
     fn warn_of_capture(&mut self) {

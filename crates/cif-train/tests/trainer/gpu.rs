@@ -182,6 +182,32 @@ fn exposures_of_cameras_that_disagree_are_found_as_on_the_processor() {
     }
 }
 
+#[test]
+fn exposures_of_images_are_found_as_on_the_processor() {
+    let Some(gpu) = testing::gpu() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let scene =
+        Scene { times: 4, views: 4, one_camera: true, disagree: true, masks: false, ..Scene::default() };
+    let mut dataset = with_known_points(capture(folder.path(), scene));
+    dataset.frames.iter_mut().for_each(|frame| frame.camera_name = "phone".into());
+    let mut config = TrainConfig { background: [0.0; 3], ..small_config() };
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (60, 60, 0);
+    config.effects.exposure_in_time = true;
+    config.densify.until = 0;
+    let [cpu, on_gpu] = [None, Some(&gpu)].map(|gpu| run(&dataset, &config, gpu, u64::MAX));
+    let [expected, found] = [&cpu, &on_gpu].map(|trainer| &trainer.field().record.drawing);
+    for time in &dataset.times {
+        let [expected, found] = [expected, found].map(|drawing| drawing.exposure("phone", *time).unwrap());
+        let pairs = expected.gain.iter().chain(&expected.offset).zip(found.gain.iter().chain(&found.offset));
+        let apart = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(apart < 0.01, "{time}: {expected:?} and {found:?}");
+    }
+    let stops = |time: &f64| found.exposure("phone", *time).unwrap().stops();
+    let first = stops(&dataset.times[0]);
+    let spread = dataset.times.iter().map(|time| (stops(time) - first).abs()).fold(0.0, f64::max);
+    assert!(spread > 0.3, "{spread} stops apart");
+}
+
 /// Settings of a few steps under which everything that may be skipped is judged, and outputs and degrees are taken
 /// back.
 fn judging_config() -> TrainConfig {
