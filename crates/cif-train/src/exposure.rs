@@ -7,10 +7,10 @@ mod brightness;
 use std::collections::BTreeMap;
 
 use cif_dataset::{Dataset, Split};
-use cif_field::{Drawing, Field, TimedExposure};
+use cif_field::{Drawing, TimedExposure};
 use serde::{Deserialize, Serialize};
 
-pub(crate) use self::brightness::{Brightness, Recorded, known_points};
+pub(crate) use self::brightness::{Recorded, known_points};
 use crate::adam::{Moments, RowRates};
 
 pub use cif_field::Exposure;
@@ -206,12 +206,6 @@ impl Exposures {
         let cameras = if self.times.is_empty() { &[][..] } else { &self.cameras[..] };
         cameras.iter().map(|camera| (camera.clone(), self.series(camera))).collect()
     }
-}
-
-/// Exposures that a scene was trained with, by camera; empty where it was trained without.
-#[must_use]
-pub fn trained_exposures(field: &Field) -> BTreeMap<String, Exposure> {
-    field.record.drawing.exposures.clone()
 }
 
 #[cfg(test)]

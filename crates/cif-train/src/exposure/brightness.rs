@@ -1,7 +1,7 @@
 //! How bright images record points: beside their known colours, and beside one another.
 
 use cif_dataset::{Dataset, PointSource};
-use cif_geometry::stats::median;
+use cif_geometry::stats::{median, upper_median};
 use cif_geometry::{PinholeCamera, PixelGrid};
 use glam::DVec3;
 
@@ -27,39 +27,9 @@ pub(crate) fn known_points(dataset: &Dataset) -> Vec<Point> {
     all.step_by(points.positions.len().div_ceil(POINTS).max(1)).collect()
 }
 
-/// Logarithms of how much brighter than their points images are, by channel.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct Brightness {
-    ratios: [Vec<f64>; 3],
-}
-
-impl Brightness {
-    /// Adds an image.
-    pub(crate) fn add(&mut self, image: &PixelGrid<[u8; 3]>, camera: &PinholeCamera, points: &[Point]) {
-        for (position, color) in points {
-            let Some([x, y]) = camera.pixel_of(DVec3::from(position.map(f64::from))) else { continue };
-            let seen = image.at(x, y);
-            for channel in 0..3 {
-                let pair = [seen[channel], color[channel]];
-                // Near black and white, cameras do not record in proportion.
-                if pair.iter().all(|value| PROPORTIONAL.contains(value)) {
-                    let [seen, known] = pair.map(f64::from);
-                    self.ratios[channel].push((seen / known).ln());
-                }
-            }
-        }
-    }
-
-    /// Medians by channel, for half of the points may be hidden, shiny or misplaced; `None` of too few points.
-    pub(crate) fn medians(self) -> Option<[f64; 3]> {
-        let is_enough = self.ratios.iter().all(|of| of.len() >= SAMPLES);
-        is_enough.then(|| {
-            self.ratios.map(|mut of| {
-                of.sort_by(f64::total_cmp);
-                of[of.len() / 2]
-            })
-        })
-    }
+/// Logarithm of a value, NaN where cameras do not record in proportion: near black and white.
+fn brightness(value: u8) -> f64 {
+    if PROPORTIONAL.contains(&value) { f64::from(value).ln() } else { f64::NAN }
 }
 
 /// Rounds in which gains of images and brightness of points follow each other.
@@ -70,7 +40,7 @@ const ROUNDS: usize = 10;
 pub(crate) struct Recorded<'a> {
     points: &'a [Point],
     /// By image and point; NaN where it does not record one in proportion.
-    images: Vec<Vec<[f32; 3]>>,
+    images: Vec<Vec<[f64; 3]>>,
 }
 
 impl<'a> Recorded<'a> {
@@ -81,12 +51,26 @@ impl<'a> Recorded<'a> {
 
     /// Adds an image.
     pub(crate) fn add(&mut self, image: &PixelGrid<[u8; 3]>, camera: &PinholeCamera) {
-        let value = |value: u8| if PROPORTIONAL.contains(&value) { f32::from(value).ln() } else { f32::NAN };
         let of = |(position, _): &Point| {
             let pixel = camera.pixel_of(DVec3::from(position.map(f64::from)));
-            pixel.map_or([f32::NAN; 3], |[x, y]| image.at(x, y).map(value))
+            pixel.map_or([f64::NAN; 3], |[x, y]| image.at(x, y).map(brightness))
         };
         self.images.push(self.points.iter().map(of).collect());
+    }
+
+    /// Logarithms of how much brighter than their colours all images record the points, by channel: the median, for half of
+    /// these may be hidden, shiny or misplaced. `None` of too few.
+    pub(crate) fn beside_colors(&self) -> Option<[f64; 3]> {
+        let of = |channel: usize| {
+            let points = || self.points.iter().map(|(_, color)| brightness(color[channel]));
+            let beside = |image: &Vec<[f64; 3]>| {
+                image.iter().zip(points()).map(|(seen, known)| seen[channel] - known).collect::<Vec<_>>()
+            };
+            let mut ratios: Vec<f64> =
+                self.images.iter().flat_map(beside).filter(|ratio| ratio.is_finite()).collect();
+            upper_median(&mut ratios).filter(|_| ratios.len() >= SAMPLES)
+        };
+        Some([of(0)?, of(1)?, of(2)?])
     }
 
     /// Logarithms of the gains of the images, by channel, of those that record enough of the points which others record
@@ -95,7 +79,7 @@ impl<'a> Recorded<'a> {
         let mut gains = vec![[0.0_f64; 3]; self.images.len()];
         let mut is_known = vec![true; self.images.len()];
         for channel in 0..3 {
-            let value = |image: usize, point: usize| f64::from(self.images[image][point][channel]);
+            let value = |image: usize, point: usize| self.images[image][point][channel];
             for _ in 0..ROUNDS {
                 let of_point = |point: usize| {
                     let seen =

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::config::MotionConfig;
 use crate::error::TrainError;
-use crate::exposure::{Brightness, Recorded, known_points};
+use crate::exposure::{Recorded, known_points};
 use crate::mask_table::MaskTable;
 use crate::phase::Phase;
 use crate::phases::Phases;
@@ -219,14 +219,12 @@ fn exposures(
     let (mut of_cameras, mut drift) = (Vec::new(), None::<f64>);
     for frames in spread(&cameras.values().collect::<Vec<_>>(), EXPOSED_CAMERAS) {
         let wanted = if cameras.len() > 1 { EXPOSED_IMAGES } else { EXPOSED_IMAGES_OF_ONE };
-        let (mut all, mut recorded) = (Brightness::default(), Recorded::of(&points));
+        let mut recorded = Recorded::of(&points);
         for (index, frame) in spread(frames, wanted) {
             phases.check()?;
-            let image = dataset.load_image(index, [1.0; 3])?;
-            all.add(&image, &frame.camera, &points);
-            recorded.add(&image, &frame.camera);
+            recorded.add(&dataset.load_image(index, [1.0; 3])?, &frame.camera);
         }
-        of_cameras.extend(all.medians());
+        of_cameras.extend(recorded.beside_colors());
         // Photographs of one moment have exposures of their own too, but nothing tells those of others.
         let mut times: Vec<usize> = frames.iter().map(|(_, frame)| frame.time_index).collect();
         times.sort_unstable();

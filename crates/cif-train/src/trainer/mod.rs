@@ -93,7 +93,7 @@ use crate::engine::Engine;
 use crate::engine::processor::Processor;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
-use crate::exposure::{Brightness, Exposures, known_points};
+use crate::exposure::{Exposures, Recorded, known_points};
 use crate::frames::FrameStore;
 use crate::guidance::Guidance;
 use crate::heads::{Head, HeadTensors, configured};
@@ -324,9 +324,9 @@ impl Trainer {
             for view in 0..frames.len() {
                 phases.check()?;
                 let frame = &dataset.frames[frames.index(view)];
-                let mut brightness = Brightness::default();
-                brightness.add(&frames.get(dataset, view)?.image, &frame.camera, &points);
-                if let Some(gains) = brightness.medians() {
+                let mut recorded = Recorded::of(&points);
+                recorded.add(&frames.get(dataset, view)?.image, &frame.camera);
+                if let Some(gains) = recorded.beside_colors() {
                     exposures.begin_with(&frame.camera_name, frame.time, gains);
                 }
             }

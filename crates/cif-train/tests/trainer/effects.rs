@@ -4,7 +4,7 @@ use crate::support::{
     Scene, capture, relative_gain, small_config, stopped_after, train, with_known_points, without_record,
 };
 use cif_dataset::{Dataset, Frame, Split};
-use cif_train::exposure::{Exposure, trained_exposures};
+use cif_train::exposure::Exposure;
 use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
 use cif_train::plan::EffectKind;
 use cif_train::{Control, EffectChoice, EffectPlan, Outcome, Stage, TrainConfig, TrainEvent, Trainer};
@@ -239,7 +239,7 @@ fn exposures_are_learnt_where_cameras_disagree() {
     println!("cameras disagree: {gained:.2} dB with exposures, {plain:.2} dB without");
     assert!(gained > plain + 0.2, "{gained} dB with exposures, {plain} dB without");
     // What was learnt is what was put in, relative to the average camera.
-    let learnt = trained_exposures(with.field());
+    let learnt = with.field().record.drawing.exposures.clone();
     assert_eq!(learnt.len(), 4);
     for view in 0..4 {
         let Exposure { gain, offset } = learnt[&format!("cam{view}")];
@@ -248,7 +248,7 @@ fn exposures_are_learnt_where_cameras_disagree() {
             assert!((of_grey / truth - 1.0).abs() < 0.12, "{view} {channel}: {of_grey} for {truth}");
         }
     }
-    assert!(trained_exposures(without.field()).is_empty());
+    assert!(without.field().record.drawing.exposures.clone().is_empty());
 
     let folder = tempfile::tempdir().unwrap();
     let agree = with_known_points(capture(folder.path(), Scene { times: 2, ..Scene::default() }));
@@ -305,7 +305,7 @@ fn a_resumed_run_goes_on_with_its_exposures() {
     config.effects.exposure = true;
     config.report.step_every = 1;
     let whole = train(dataset.clone(), config.clone());
-    let (expected, work) = (trained_exposures(whole.field()), whole.work());
+    let (expected, work) = (whole.field().record.drawing.exposures.clone(), whole.work());
     assert!(expected.values().any(|exposure| *exposure != Exposure::NEUTRAL));
     for stop_at in [11_u64, 35, 60] {
         let path = folder.path().join("stopped.cif");
@@ -314,7 +314,10 @@ fn a_resumed_run_goes_on_with_its_exposures() {
         let mut resumed = Trainer::resume(dataset.clone(), loaded).unwrap();
         assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
         assert_eq!(without_record(resumed.field()), without_record(whole.field()), "stopped after {stop_at}");
-        assert_eq!((trained_exposures(resumed.field()), resumed.work()), (expected.clone(), work));
+        assert_eq!(
+            (resumed.field().record.drawing.exposures.clone(), resumed.work()),
+            (expected.clone(), work)
+        );
     }
 }
 

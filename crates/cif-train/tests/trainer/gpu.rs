@@ -4,7 +4,6 @@ use crate::support::{Scene, capture, relative_gain, small_config, with_known_poi
 use cif_dataset::Dataset;
 use cif_field::{Checkpoint, Field};
 use cif_render::wgpu::{Gpu, testing};
-use cif_train::exposure::trained_exposures;
 use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
 use cif_train::{Control, Outcome, TrainConfig, TrainError, TrainEvent, Trainer};
 
@@ -168,7 +167,8 @@ fn exposures_of_cameras_that_disagree_are_found_as_on_the_processor() {
     let (expected, found) = (scores(&cpu).0, scores(&on_gpu).0);
     eprintln!("PSNR {expected:.2} and {found:.2} dB");
     assert!((found - expected).abs() < 0.2, "{expected} and {found} dB");
-    let (of_cpu, learnt) = (trained_exposures(cpu.field()), trained_exposures(on_gpu.field()));
+    let (of_cpu, learnt) =
+        (cpu.field().record.drawing.exposures.clone(), on_gpu.field().record.drawing.exposures.clone());
     assert_eq!(learnt.len(), 4);
     for view in 0..4 {
         let [of_cpu, learnt] = [&of_cpu, &learnt].map(|all| all[&format!("cam{view}")]);
@@ -288,7 +288,7 @@ fn judged_runs_go_on_on_either_backend_and_end_the_same_on_a_gpu() {
     ] {
         let stopped = run(&dataset, &config, first, stop_at);
         stopped.checkpoint(true).save(&path).unwrap();
-        let saved = trained_exposures(stopped.field());
+        let saved = stopped.field().record.drawing.exposures.clone();
         assert!(saved.values().any(|exposure| *exposure != cif_train::exposure::Exposure::NEUTRAL));
         let mut resumed = Trainer::resume(dataset.clone(), Checkpoint::load(&path).unwrap()).unwrap();
         if let Some(gpu) = second {
@@ -302,7 +302,10 @@ fn judged_runs_go_on_on_either_backend_and_end_the_same_on_a_gpu() {
         if first.is_some() && second.is_some() {
             let plain = |field: &Field| Field { record: Default::default(), ..field.clone() };
             assert!(plain(field) == plain(whole.field()), "stopped after {stop_at}");
-            assert_eq!(trained_exposures(field), trained_exposures(whole.field()));
+            assert_eq!(
+                field.record.drawing.exposures.clone(),
+                whole.field().record.drawing.exposures.clone()
+            );
         }
     }
 }
