@@ -70,6 +70,7 @@ impl SceneFormat for Gltf {
             most_expensive_motion: Some(MOST_EXPENSIVE_MOTION),
             note_on_place: None,
             options: &[],
+            is_read: true,
         };
         &ABOUT
     }

@@ -175,6 +175,7 @@ pub(crate) fn scene(recipe: Recipe) -> SceneGraph {
         background_color: [1.0, 0.3, 0.1],
         sort_metric: cif_field::SortMetric::Z,
         antialiased: Some(true),
+        near: None,
         omitted: vec!["lost thing".into()],
         warnings: vec!["a warning".into()],
         origin: Origin { field_fingerprint: Some("0123abcd".into()), options: Some(SceneOptions::default()) },

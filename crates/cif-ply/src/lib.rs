@@ -45,6 +45,7 @@ impl SceneFormat for Ply {
                  and `world scale` tell it: a place in the world is that in the file / scale + offset",
             ),
             options: &["time_code", "turn_up"],
+            is_read: true,
         };
         &ABOUT
     }

@@ -162,6 +162,8 @@ pub struct About {
     pub note_on_place: Option<&'static str>,
     /// Keys of [`ExportOptions`], beside `force`, that a single file of this format knows.
     pub options: &'static [&'static str],
+    /// False for files that are made to be looked at, and not read back.
+    pub is_read: bool,
 }
 
 /// An ending of file names.

@@ -234,6 +234,7 @@ pub(crate) fn node_of(places: &[DVec3], scales: [f32; 3]) -> Node {
 pub(crate) fn graph_of(nodes: Vec<Node>) -> SceneGraph {
     SceneGraph {
         antialiased: None,
+        near: None,
         up_axis: UpAxis::Z,
         meters_per_unit: 1.0,
         frame: CaptureFrame::default(),

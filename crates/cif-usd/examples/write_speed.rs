@@ -108,6 +108,7 @@ fn scene(count: usize, samples: usize) -> SceneGraph {
         background_color: [0.0; 3],
         sort_metric: cif_field::SortMetric::Z,
         antialiased: None,
+        near: None,
         omitted: Vec::new(),
         warnings: Vec::new(),
         origin: Origin::default(),

@@ -89,6 +89,7 @@ impl SceneFormat for Usd {
             most_expensive_motion: Some(MotionModel::Dense),
             note_on_place: None,
             options: &["payloads", "levels_of_detail", "ground", "density", "weld_kinematic"],
+            is_read: true,
         };
         &ABOUT
     }

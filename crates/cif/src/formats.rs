@@ -7,9 +7,11 @@ use cif_scene::{ExportOptions, ExportSummary, ReadOptions, SceneFormat, SceneGra
 
 use crate::error::Error;
 use crate::lock::Lock;
+use crate::pictures::instance_color;
 
-/// Every format that is read and written. A new one is a crate that implements [`SceneFormat`], and a line here.
-pub static FORMATS: [&dyn SceneFormat; 3] = [&cif_usd::Usd, &cif_gltf::Gltf, &cif_ply::Ply];
+/// Every format that is read or written. A new one is a crate that implements [`SceneFormat`], and a line here.
+pub static FORMATS: [&dyn SceneFormat; 4] =
+    [&cif_usd::Usd, &cif_gltf::Gltf, &cif_ply::Ply, &cif_web::Html { color: instance_color }];
 
 /// Content of a file, by its name.
 #[derive(Clone, Copy)]
@@ -82,7 +84,8 @@ pub fn endings() -> String {
             format.about().endings.iter().map(|ending| format!(".{}", ending.name)).collect();
         format!("{} ({})", endings.join(", "), format.about().name)
     };
-    let mut all: Vec<String> = FORMATS.iter().map(of_format).collect();
+    let mut all: Vec<String> =
+        FORMATS.iter().filter(|format| format.about().is_read).map(of_format).collect();
     let last = all.pop().unwrap_or_default();
     format!("{} or {last}", all.join(", "))
 }

@@ -174,6 +174,7 @@ mod tests {
             background_color: [1.0; 3],
             sort_metric: cif_field::SortMetric::Z,
             antialiased: None,
+            near: None,
             omitted: Vec::new(),
             warnings: Vec::new(),
             origin: cif_scene::Origin::default(),

@@ -6,7 +6,7 @@ use std::process::Command;
 use serde_json::Value;
 
 /// Row of every crate; 0 is the lowest.
-const ROWS: [(&str, u32); 19] = [
+const ROWS: [(&str, u32); 20] = [
     ("cif-geometry", 0),
     ("cif-output", 0),
     ("cif-input", 0),
@@ -22,6 +22,7 @@ const ROWS: [(&str, u32); 19] = [
     ("cif-usd", 4),
     ("cif-gltf", 4),
     ("cif-ply", 4),
+    ("cif-web", 4),
     ("cif-exr", 4),
     ("cif-bench", 5),
     ("cif", 6),

@@ -72,6 +72,7 @@ pub fn assemble(mut found: Prims) -> Result<SceneGraph, AssembleError> {
         background_color: found.background_color,
         sort_metric: found.sort_metric,
         antialiased: found.antialiased,
+        near: None,
         omitted: found.omitted,
         warnings,
         origin: found.origin,

@@ -168,6 +168,7 @@ pub fn build_from(
         background_color: field.background,
         sort_metric: field.sort_metric,
         antialiased: field.record.drawing.antialiased,
+        near: field.record.drawing.near,
         omitted,
         warnings,
         origin: Origin { field_fingerprint: Some(field.fingerprint()), options: Some(options.clone()) },

@@ -32,6 +32,9 @@ pub struct SceneGraph {
     /// True when the splats are drawn antialiased: footprints widened, and their opacity lowered in turn; `None` where
     /// that is not known, which means not.
     pub antialiased: Option<bool>,
+    /// Distance of the near plane that the scene was trained with, world units; `None` where that is not known. Files of
+    /// exchange do not hold it.
+    pub near: Option<f32>,
     /// Labels of instances that no visible Gaussian belongs to, so that they have no node.
     pub omitted: Vec<String>,
     /// Warnings for the user, one sentence each.

@@ -345,6 +345,7 @@ impl Maker {
             background_color: [0.1, 0.2, 0.3],
             sort_metric: cif_field::SortMetric::Distance,
             antialiased: Some(true),
+            near: None,
             omitted: vec!["ghost".to_owned()],
             warnings: vec!["colours change".to_owned()],
             origin: Origin {

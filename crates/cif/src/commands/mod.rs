@@ -19,6 +19,7 @@ mod query;
 mod render;
 pub(crate) mod shared;
 mod train;
+mod view;
 
 use std::ffi::OsString;
 
@@ -58,6 +59,7 @@ A short tour:
   cif plan captures/table                                which effects does it call for?
   cif train captures/table -o table.cif                  train it (--preset draft for a quick look)
   cif eval table.cif captures/table --images pictures    score the held-out views, and look at them
+  cif view table.cif                                     look at it in a browser
   cif export table.cif table.usda                        one moving prim per object
   cif import table.usda --base table.cif -o new.cif      apply the edits of that file
   cif query table.usda --label 'red mug' --time 36       which prim is it, and where?
@@ -85,6 +87,7 @@ enum Command {
     Plan(plan::Plan),
     Train(train::Train),
     Eval(eval::Eval),
+    View(view::View),
     Render(render::Render),
     Export(export::Export),
     Import(import::Import),
@@ -164,6 +167,7 @@ fn dispatch(command: Command) -> Result<(), Error> {
         Command::Plan(command) => plan::run(&command),
         Command::Train(command) => train::run(&command),
         Command::Eval(command) => eval::run(&command),
+        Command::View(command) => view::run(&command),
         Command::Render(command) => render::run(&command),
         Command::Export(command) => export::run(&command),
         Command::Import(command) => import::run(&command),

@@ -28,13 +28,25 @@ pub fn save_rgb(path: &Path, picture: &Picture) -> Result<(), Error> {
 /// # Errors
 /// When the picture is empty.
 pub fn png_bytes(picture: &Picture) -> Result<Vec<u8>, Error> {
+    encoded(ColorType::Rgb, picture.width, picture.height, picture.pixels.as_flattened())
+}
+
+/// An 8-bit PNG of red, green, blue and alpha in memory.
+///
+/// # Errors
+/// When the picture is empty.
+pub fn png_bytes_clear(picture: &PixelGrid<[u8; 4]>) -> Result<Vec<u8>, Error> {
+    encoded(ColorType::Rgba, picture.width, picture.height, picture.pixels.as_flattened())
+}
+
+fn encoded(color: ColorType, width: u32, height: u32, values: &[u8]) -> Result<Vec<u8>, Error> {
     let failed = |error: png::EncodingError| Error::plain(format!("cannot encode a picture: {error}"));
     let mut bytes = Vec::new();
-    let mut encoder = Encoder::new(&mut bytes, picture.width, picture.height);
-    encoder.set_color(ColorType::Rgb);
+    let mut encoder = Encoder::new(&mut bytes, width, height);
+    encoder.set_color(color);
     encoder.set_depth(BitDepth::Eight);
     let mut writer = encoder.write_header().map_err(failed)?;
-    writer.write_image_data(picture.pixels.as_flattened()).and_then(|()| writer.finish()).map_err(failed)?;
+    writer.write_image_data(values).and_then(|()| writer.finish()).map_err(failed)?;
     Ok(bytes)
 }
 

@@ -70,7 +70,10 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
     let folder = tempfile::tempdir()
         .map_err(|error| Error::plain(format!("cannot make a temporary folder: {error}")))?;
     // A format that does not work is reported once, and left out of all rungs.
-    let moving = FORMATS.into_iter().filter(|format| format.about().most_expensive_motion.is_some());
+    let moving = FORMATS.into_iter().filter(|format| {
+        let about = format.about();
+        about.is_read && about.most_expensive_motion.is_some()
+    });
     let mut formats: Vec<&dyn SceneFormat> = if command.no_files { Vec::new() } else { moving.collect() };
     let mut rungs = Vec::new();
     for &tolerance in &command.tolerances {

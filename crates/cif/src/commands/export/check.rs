@@ -191,6 +191,12 @@ impl Check {
                 },
             ));
         }
+        if let Some(target) = targets.iter().find(|target| !target.format.about().is_read) {
+            return Err(Error::usage(
+                format!("{target:?}: --check reads what was written, and this is not read back"),
+                "leave --check or this file out; a USD stage holds the same scene",
+            ));
+        }
         if bakes_blur {
             return Err(Error::usage(
                 "--check draws with the filter of the renderer, which would be there twice with the blur baked",

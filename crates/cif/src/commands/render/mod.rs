@@ -1,6 +1,8 @@
 //! `cif render`: pictures of a scene from captured or new views.
 
 mod files;
+mod film;
+mod flight;
 mod layers;
 mod painter;
 
@@ -11,6 +13,7 @@ use cif_dataset::cryptomatte::BACKGROUND;
 use cif_exr::ColorEncoding;
 use cif_field::Field;
 use cif_geometry::{PinholeCamera, PixelGrid};
+use cif_output::Workplace;
 use cif_render::constants::MIN_COVERAGE;
 use cif_render::cpu::{BandRequest, Renderer};
 use cif_render::quality::{self, Quality};
@@ -36,6 +39,8 @@ use crate::output::Outputs;
 use crate::report::{JsonReport, Report};
 use crate::{endings, interrupt, output};
 use files::ViewFiles;
+use film::FilmFile;
+use flight::{Film, Flight, Size};
 use layers::What;
 use painter::Painter;
 #[cfg(feature = "wgpu")]
@@ -44,7 +49,7 @@ use painter::Sample;
 /// Render a scene from captured or new views
 #[derive(Debug, Args)]
 #[command(
-    group = ArgGroup::new("views").required(true).args(["capture", "camera"]),
+    group = ArgGroup::new("views").required(true).args(["capture", "camera", "path"]),
     after_help = after_help(),
 )]
 pub(super) struct Render {
@@ -55,16 +60,27 @@ pub(super) struct Render {
     #[arg(long, value_name = "CAPTURE")]
     capture: Option<PathBuf>,
     /// Frames of the capture
-    #[arg(long, default_value = "val", value_name = "SPLIT", conflicts_with = "camera")]
+    #[arg(long, default_value = "val", value_name = "SPLIT", conflicts_with_all = ["camera", "path"])]
     split: SplitName,
     /// Render the views of a camera file
     #[arg(long, value_name = "FILE.json")]
     camera: Option<PathBuf>,
+    /// Fly along a path, one view per captured time: orbit (around the objects, where cameras have been), cameras
+    /// (through the recorded ones) or follow:LABEL (along with an object)
+    #[arg(long, value_name = "PATH")]
+    path: Option<Flight>,
+    /// Size of the views of a path, as in 1280x720 [default: that of the recorded cameras]
+    #[arg(long, value_name = "WxH", requires = "path")]
+    size: Option<Size>,
+    /// Pictures per second of a film [default: those of the scene]
+    #[arg(long, value_name = "RATE", value_parser = rate)]
+    fps: Option<f64>,
     /// Time of all views instead of their own: a frame (36), seconds (1.5s) or a share (50%)
     #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
     time: Option<Moment>,
-    /// Folder to write into: DIR/WHAT/VIEW.png
-    #[arg(short, long, value_name = "DIR", value_parser = endings::folder())]
+    /// Folder to write into: DIR/WHAT/VIEW.png; or a film of one layer, made by ffmpeg: out.mp4, .mov, .mkv, .webm,
+    /// .avi or .gif
+    #[arg(short, long, value_name = "DIR|FILM", value_parser = endings::folder_or_film())]
     output: PathBuf,
     /// Layers to write, comma separated [default: rgb, or none with --exr]
     #[arg(long, value_delimiter = ',', value_name = "WHAT")]
@@ -151,8 +167,16 @@ fn after_help() -> String {
          cif render table.cif --capture captures/table --split val -o out --what rgb,instance,depth\n  \
          cif render table.cif --capture captures/table -o look --quality draft\n  \
          cif render table.cif --capture captures/table -o paths --what tracks\n  \
-         cif render table.cif --camera views.json --time 50% -o out\n\n{FORMAT_HELP}"
+         cif render table.cif --camera views.json --time 50% -o out\n  \
+         cif render table.cif --path orbit -o orbit.mp4\n  \
+         cif render table.cif --path 'follow:red mug' --what instance-color --size 1280x720 -o mug.mp4\n\n{FORMAT_HELP}"
     )
+}
+
+/// Pictures per second, above 0.
+fn rate(text: &str) -> Result<f64, String> {
+    let rate = text.parse::<f64>().ok().filter(|rate| rate.is_finite() && *rate > 0.0);
+    rate.ok_or_else(|| "a number of pictures per second above 0 is expected".to_owned())
 }
 
 pub(super) fn run(command: &Render) -> Result<(), Error> {
@@ -180,12 +204,21 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     let mut outputs = Outputs::new(command.force);
     outputs.reads(&command.scene)?;
     command.report.check(&mut outputs)?;
-    let views = views(command, &field, &mut outputs)?;
+    let Film { shots: views, per_second } = views(command, &field, &mut outputs)?;
+    let is_film = endings::is_film(&command.output);
+    check_film(command, is_film, what.len())?;
     if what.contains(&What::DepthColor) {
         check_memory(&views)?;
     }
-    output::check_folder(&command.output, command.force)?;
-    for Shot { view, .. } in &views {
+    // Pictures of a film go through a folder that is gone afterwards.
+    let passing = if is_film { Some(Workplace::create("cif-film-").map_err(Error::plain)?) } else { None };
+    let folder = passing.as_ref().map_or(command.output.as_path(), Workplace::path);
+    if is_film {
+        outputs.file(&command.output)?;
+    } else {
+        output::check_folder(folder, command.force)?;
+    }
+    for Shot { view, .. } in views.iter().filter(|_| !is_film) {
         for what in &what {
             outputs.picture(&command.output.join(what.folder()), &view.name, "png")?;
         }
@@ -210,6 +243,7 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     let trajectories = what.contains(&What::Tracks).then(|| Trajectories::new(&field, command.simd.into()));
     interrupt::watch();
     let settings = quality.settings(&settings);
+    let mut film = is_film.then(|| FilmFile::create(&command.output, per_second)).transpose()?;
     let clock = SystemClock::start();
     let start = clock.now();
     for (index, Shot { view, camera }) in views.iter().enumerate() {
@@ -223,7 +257,7 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
             image
         };
         let lines = trajectories.as_ref().map(|paths| paths.lines(&view.camera, time)).unwrap_or_default();
-        let mut files = ViewFiles::create(&what, &field, &command.output, view, lines)?;
+        let mut files = ViewFiles::create(&what, &field, folder, view, lines)?;
         match &mut painter {
             Painter::Cpu(renderer) if command.exr => {
                 let place = Place { field: &field, views: &views, index, time: time_of_all };
@@ -245,7 +279,13 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
             }
         }
         files.finish()?;
+        if let (Some(film), Some(what)) = (&mut film, what.first()) {
+            let picture = output::inside(&folder.join(what.folder()), &view.name, "png")?;
+            film.add(&std::fs::read(&picture).map_err(Error::io("read", &picture))?)?;
+            std::fs::remove_file(&picture).map_err(Error::io("remove", &picture))?;
+        }
     }
+    film.map_or(Ok(()), FilmFile::finish)?;
     let seconds = (clock.now() - start).wall_s;
     outcome!("rendered {} views into {}", views.len(), command.output.display());
     let layers: Vec<String> =
@@ -277,6 +317,23 @@ fn check_look(command: &Render, field: &Field) -> Result<(), Error> {
     Ok(())
 }
 
+/// Refuses films of several layers, and rates of what is no film.
+fn check_film(command: &Render, is_film: bool, layers: usize) -> Result<(), Error> {
+    if is_film && (command.exr || layers != 1) {
+        return Err(Error::usage(
+            "a film shows one layer",
+            "name one with --what, or a folder of pictures instead of the film: -o views",
+        ));
+    }
+    if !is_film && command.fps.is_some() {
+        return Err(Error::usage(
+            "--fps is about a film, and a folder of pictures is written",
+            "name a film: -o out.mp4",
+        ));
+    }
+    Ok(())
+}
+
 fn pixels(camera: &PinholeCamera) -> u64 {
     u64::from(camera.width) * u64::from(camera.height)
 }
@@ -296,7 +353,7 @@ fn check_memory(views: &[Shot]) -> Result<(), Error> {
 /// Views that were rendered.
 #[derive(Serialize)]
 struct RenderReport<'a> {
-    /// Folder of the files.
+    /// Folder of the files, or the film.
     output: &'a Path,
     /// Wall time of rendering and writing, seconds.
     seconds: f64,
@@ -317,7 +374,7 @@ struct ViewReport<'a> {
     width: u32,
     /// Height, pixels.
     height: u32,
-    /// Files, by the layer that they hold: a value of `--what`, or `exr`.
+    /// Files, by the layer that they hold: a value of `--what`, or `exr`; none of a film.
     files: BTreeMap<String, String>,
 }
 
@@ -345,7 +402,10 @@ fn report<'a>(
             time: time_of_all.or(view.time).unwrap_or(0.0),
             width: view.camera.width,
             height: view.camera.height,
-            files: layers.iter().map(file).collect::<Result<_, Error>>()?,
+            files: match endings::is_film(&command.output) {
+                true => BTreeMap::new(),
+                false => layers.iter().map(file).collect::<Result<_, Error>>()?,
+            },
         })
     };
     let views = views.iter().map(view).collect::<Result<Vec<_>, Error>>()?;
@@ -448,7 +508,19 @@ struct Shot {
     camera: String,
 }
 
-fn views(command: &Render, field: &Field, outputs: &mut Outputs) -> Result<Vec<Shot>, Error> {
+/// The views, and how many of them are shown per second.
+fn views(command: &Render, field: &Field, outputs: &mut Outputs) -> Result<Film, Error> {
+    let film = match &command.path {
+        Some(path) => flight::film(field, path, command.size, &command.scene.display().to_string())?,
+        None => Film {
+            shots: given_views(command, field, outputs)?,
+            per_second: field.timeline.frames_per_second,
+        },
+    };
+    Ok(Film { per_second: command.fps.unwrap_or(film.per_second), ..film })
+}
+
+fn given_views(command: &Render, field: &Field, outputs: &mut Outputs) -> Result<Vec<Shot>, Error> {
     if let Some(path) = &command.camera {
         outputs.reads(path)?;
         let mut views = camera_file::read(path)?;
@@ -460,7 +532,7 @@ fn views(command: &Render, field: &Field, outputs: &mut Outputs) -> Result<Vec<S
         return Ok(views.into_iter().map(|view| Shot { view, camera: String::new() }).collect());
     }
     let Some(capture) = &command.capture else {
-        return Err(Error::usage("no views", "give --capture or --camera"));
+        return Err(Error::usage("no views", "give --capture, --camera or --path"));
     };
     let mut options = command.capture_options.clone();
     options.no_masks = options.masks.is_none();
