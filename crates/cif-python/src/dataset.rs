@@ -138,9 +138,12 @@ impl Dataset {
         picture::of_frame(py, self, index, what)
     }
 
-    /// The counts as a table, for notebooks.
+    /// The first frame and the counts as a table, for notebooks.
     fn _repr_html_(&self, py: Python<'_>) -> PyResult<String> {
-        tables::of_summary(&self.__repr__(), &self.summary(py)?)
+        // An image that cannot be read is told by what needs it.
+        let frame = picture::of_frame(py, self, 0, "rgb");
+        let still = frame.ok().map(|frame| frame.as_html(py)).transpose()?.unwrap_or_default();
+        Ok(still + &tables::of_summary(&self.__repr__(), &self.summary(py)?)?)
     }
 
     /// Initial points, float32 `[P, 3]`; read-only.

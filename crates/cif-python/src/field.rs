@@ -155,9 +155,12 @@ impl Field {
         format!("Field({n} Gaussians, {k} instances, {} times)", self.inner.timeline.times.len())
     }
 
-    /// The objects as a table, for notebooks.
-    fn _repr_html_(&self) -> String {
-        tables::of_field(&self.inner)
+    /// The first view and the objects as a table, for notebooks.
+    fn _repr_html_(&self, py: Python<'_>) -> PyResult<String> {
+        // A view that memory does not hold is none to fail for.
+        let view = picture::of_field(py, self, View::Captured(0), None, "rgb");
+        let still = view.ok().map(|view| view.as_html(py)).transpose()?.unwrap_or_default();
+        Ok(still + &tables::of_field(&self.inner))
     }
 
     /// Centres before any motion, float32 `[N, 3]`, in the frame of the field; read-only.

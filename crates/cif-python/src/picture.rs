@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
 use cif::output::check_file;
 use cif::pictures::{depth_picture, instance_color, instance_picture, png_bytes, rgb_picture, save_rgb};
 use cif_render::Channels;
@@ -21,6 +23,17 @@ use crate::{arrays, process};
 #[pyclass(frozen, module = "cif")]
 pub(crate) struct Picture {
     inner: cif::pictures::Picture,
+}
+
+impl Picture {
+    fn png(&self, py: Python<'_>) -> PyResult<Vec<u8>> {
+        process::detach(py, || png_bytes(&self.inner).map_err(|error| error.with_help()))?.map_err(cif_error)
+    }
+
+    /// The picture as an element that needs nothing else.
+    pub(crate) fn as_html(&self, py: Python<'_>) -> PyResult<String> {
+        Ok(format!("<img src=\"data:image/png;base64,{}\">", BASE64_STANDARD.encode(self.png(py)?)))
+    }
 }
 
 #[pymethods]
@@ -43,9 +56,7 @@ impl Picture {
     }
 
     fn _repr_png_<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyBytes>> {
-        let bytes = process::detach(py, || png_bytes(&self.inner).map_err(|error| error.with_help()))?
-            .map_err(cif_error)?;
-        Ok(PyBytes::new(py, &bytes))
+        Ok(PyBytes::new(py, &self.png(py)?))
     }
 
     fn __repr__(&self) -> String {

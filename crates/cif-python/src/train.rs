@@ -186,7 +186,7 @@ impl Run {
             }
         };
         self.backend.apply(gpu.as_ref(), &mut trainer)?;
-        cif::training::run(&mut trainer, destination.as_mut(), observe)?;
+        cif::training::run(&mut trainer, destination.as_mut(), &mut |event, _| observe(event))?;
         Ok(trainer.into_field())
     }
 }

@@ -25,6 +25,30 @@ pub struct Page {
     pub bytes: Vec<u8>,
 }
 
+impl Page {
+    /// A page of a run that has nothing to show yet.
+    #[must_use]
+    pub fn empty(title: &str) -> Self {
+        let document = Document {
+            version: VERSION,
+            title: title.to_owned(),
+            up: up(UpAxis::Z, []),
+            meters_per_unit: None,
+            background: [0.1; 3],
+            sort: "z",
+            antialiased: false,
+            near: NEAR,
+            timeline: Timeline { start: 0.0, end: 0.0, per_second: 1.0, samples: vec![0.0] },
+            nodes: Vec::new(),
+            cameras: Vec::new(),
+            views: Vec::new(),
+            stage: None,
+            live: true,
+        };
+        Self { document, bytes: Vec::new() }
+    }
+}
+
 /// Colour of an instance in pictures, by its mask value.
 pub type InstanceColor = fn(u16) -> [u8; 3];
 
@@ -67,6 +91,8 @@ pub fn describe(
         nodes: nodes.collect(),
         cameras: graph.cameras.iter().map(camera).collect(),
         views: Vec::new(),
+        stage: None,
+        live: false,
     };
     Page { document, bytes: block.into_bytes() }
 }
@@ -198,13 +224,16 @@ fn node(
 }
 
 /// The box of a node over all sampled times.
-fn extent(graph: &SceneGraph, node: &cif_scene::Node) -> Option<[[f64; 3]; 2]> {
+fn extent(graph: &SceneGraph, node: &cif_scene::Node) -> [[f64; 3]; 2] {
     let boxes = node.boxes();
     let changes = matches!(node.motion, Motion::Parts(_) | Motion::Dense(_));
     let codes = &graph.time_codes.samples;
     let codes = if changes { codes.as_slice() } else { codes.get(..1).unwrap_or(codes) };
-    let bounds = codes.iter().map(|code| boxes.local(*code)).fold(Bounds::EMPTY, Bounds::union);
-    (!bounds.is_empty()).then(|| [bounds.low.to_array(), bounds.high.to_array()])
+    corners(&codes.iter().map(|code| boxes.local(*code)).fold(Bounds::EMPTY, Bounds::union))
+}
+
+fn corners(bounds: &Bounds) -> [[f64; 3]; 2] {
+    if bounds.is_empty() { [[0.0; 3]; 2] } else { [bounds.low.to_array(), bounds.high.to_array()] }
 }
 
 fn parts(motion: &PartsMotion, start: f64) -> Vec<Part> {
@@ -263,7 +292,7 @@ pub fn points(positions: &[[f32; 3]], colors: &[[u8; 3]], width: f32) -> (Node, 
         motion: "static".into(),
         rotation: None,
         mean_occupancy: 1.0,
-        extent: (!bounds.is_empty()).then(|| [bounds.low.to_array(), bounds.high.to_array()]),
+        extent: corners(&bounds),
         track: track(&[], DVec3::ZERO, 0.0),
         parts: Vec::new(),
         visibility: Vec::new(),

@@ -36,6 +36,10 @@ pub struct Document {
     pub cameras: Vec<Camera>,
     /// Images of the capture, by camera and time.
     pub views: Vec<View>,
+    /// Stage that edits are a layer over; `None` where none holds the nodes at their paths.
+    pub stage: Option<String>,
+    /// True when the page shall ask how far the run is that the scene comes from.
+    pub live: bool,
 }
 
 /// Times of a scene.
@@ -86,8 +90,8 @@ pub struct Node {
     pub rotation: Option<String>,
     /// Opacity-weighted mean of the occupancies.
     pub mean_occupancy: f32,
-    /// Smallest and largest corner of what can be seen of it at any time, local frame; `None` where nothing can.
-    pub extent: Option<[[f64; 3]; 2]>,
+    /// Smallest and largest corner of what can be seen of it at any time, local frame; the origin where nothing can.
+    pub extent: [[f64; 3]; 2],
     /// `world_from_local`.
     pub track: Track,
     /// Rigid parts, whose ranges partition the splats; empty where the node has none.

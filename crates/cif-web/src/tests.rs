@@ -173,7 +173,7 @@ fn a_page_holds_what_the_graph_holds() {
     let offsets = read(jelly.deformation.as_ref().unwrap().offsets, bytes);
     assert_eq!(offsets.len(), 2 * 6 * 3);
     assert!((offsets[18] - 0.3).abs() < 1e-5 && offsets[19].abs() < 1e-5 && (offsets[20] + 0.3).abs() < 1e-5);
-    let [low, high] = jelly.extent.unwrap();
+    let [low, high] = jelly.extent;
     let first = graph.nodes[2].boxes().local(0.0);
     assert!(high[0] > first.high.x + 0.25 && low[2] < first.low.z - 0.25, "the box holds all times");
 }

@@ -1,24 +1,25 @@
 //! A training run with the file that it saves into.
 
-use cif_train::{Control, Outcome, Phase, TrainError, TrainEvent, Trainer};
+use cif_train::{Control, Outcome, Phase, TrainError, TrainEvent, Trainer, TrainerView};
 
 use crate::destination::{Destination, Unsaved};
 use crate::error::Error;
 
 /// Runs a trainer to its end or to a request to stop, and saves into `destination`, where there is one, whenever the
 /// run asks for it and in the end. A run that was stopped, or that failed on the way, is saved with its state, unless it
-/// was stopped before it had done anything: what is there, or is not, then stays as it is.
+/// was stopped before it had done anything: what is there, or is not, then stays as it is. `observe` gets the run at the
+/// events that come from it.
 ///
 /// # Errors
 /// When training fails or a state cannot be saved.
 pub fn run(
     trainer: &mut Trainer,
     mut destination: Option<&mut Destination>,
-    observe: &mut dyn FnMut(&TrainEvent) -> Control,
+    observe: &mut dyn FnMut(&TrainEvent, Option<&TrainerView<'_>>) -> Control,
 ) -> Result<Outcome, Error> {
     let mut taken = None;
     let outcome = trainer.run(&mut |event, view| {
-        let control = observe(event);
+        let control = observe(event, Some(view));
         if matches!(event, TrainEvent::CheckpointDue { .. })
             && let Some(destination) = destination.as_deref_mut()
         {
@@ -33,9 +34,8 @@ pub fn run(
                 }
                 // There may be space again when the next state is due.
                 Err(Unsaved::Refused(error)) => {
-                    observe(&TrainEvent::Warning {
-                        message: format!("{error}; the run continues without saving"),
-                    });
+                    let message = format!("{error}; the run continues without saving");
+                    observe(&TrainEvent::Warning { message }, None);
                 }
             }
         }

@@ -117,6 +117,8 @@ export class Comparison {
     this.store = new ImageStore();
     this.image = byId('image', HTMLCanvasElement);
     this.mask = byId('mask', HTMLCanvasElement);
+    /** @type {Map<View, string>} */
+    this.ratios = new Map();
     this.photo = document.createElement('canvas');
     this.psnr = byId('psnr', HTMLOutputElement);
     this.camera = byId('camera', HTMLSelectElement);
@@ -175,9 +177,17 @@ export class Comparison {
   /** @param {number} camera Index, or -1 for the free camera. */
   lookThrough(camera) {
     const { app } = this;
-    if (camera < 0) app.leaveCamera();
-    else if (this.views.byCamera[camera].length) app.set({ camera, cameraCode: app.state.code });
-    else app.set({ camera, cameraCode: app.state.code, compare: 'render', mask: false });
+    if (camera < 0) {
+      app.leaveCamera();
+      return;
+    }
+    const hasImages = this.views.byCamera[camera].length > 0;
+    const { code, mask } = app.state;
+    const compare = app.state.compare === 'render' && isCapture(app.scene) ? 'image' : app.state.compare;
+    const patch = hasImages
+      ? { compare, mask }
+      : { compare: /** @type {Compared} */ ('render'), mask: false };
+    app.set({ camera, cameraCode: code, ...patch });
   }
 
   /**
@@ -220,7 +230,7 @@ export class Comparison {
     byId('view-name', HTMLOutputElement).textContent = view ? `${view.name} (${view.split})` : 'none';
     byId('view-name', HTMLOutputElement).title = view?.name ?? '';
     this.showLayers(this.views.shown(state));
-    this.measureLater();
+    this.showRatio();
   }
 
   /** @param {View | null} view */
@@ -287,35 +297,51 @@ export class Comparison {
     for (const address of [next.image, next.mask]) if (address) this.store.load(address).catch(() => {});
   }
 
-  measureLater() {
+  /** Shows the ratio of the present view, which is measured when nothing has changed for a while. */
+  showRatio() {
     clearTimeout(this.timer);
-    const ready = this.view !== null && this.drawn === this.view && !this.app.state.playing;
-    this.psnr.dataset.value = 'none';
-    if (this.app.state.playing) this.psnr.textContent = 'when paused';
-    else this.psnr.textContent = this.view ? 'measuring' : 'choose a comparison';
-    if (ready && !isCapture(this.app.scene)) this.timer = window.setTimeout(() => this.measure(), PSNR_DELAY);
+    const { view } = this;
+    const known = view && this.ratios.get(view);
+    this.psnr.dataset.value = known ? 'some' : 'none';
+    this.psnr.textContent = known ?? this.missingRatio();
+    const ready = view && view === this.drawn && !known && !this.app.state.playing;
+    if (ready && !isCapture(this.app.scene))
+      this.timer = window.setTimeout(() => this.measure(view), PSNR_DELAY);
   }
 
-  measure() {
-    const { app, view, image } = this;
-    if (!view) return;
-    const { width, height } = image;
+  /** @returns {string} Why there is no ratio. */
+  missingRatio() {
+    if (!this.view) return 'choose a comparison';
+    if (this.app.state.playing) return 'when paused';
+    return this.view === this.drawn ? 'measuring' : 'no image yet';
+  }
+
+  /** @param {View} view */
+  measure(view) {
+    const { engine } = this.app;
+    const photo = this.readImage();
+    if (photo) {
+      engine.setTime(view.code);
+      const shot = resizeCamera(view, photo.width, photo.height);
+      const render = engine.pixels(shot, 0.3 * (photo.height / view.size[1]) ** 2, true);
+      this.ratios.set(view, `${psnrOf(render, photo.data).toFixed(2)} dB`);
+    } else {
+      this.ratios.set(view, 'not for local files');
+    }
+    this.showRatio();
+  }
+
+  /** @returns {ImageData | null} Pixels of the image; null where the page may not read them. */
+  readImage() {
+    const { width, height } = this.image;
     Object.assign(this.photo, { width, height });
     const context = context2d(this.photo, true);
-    context.drawImage(image, 0, 0);
-    let photo;
+    context.drawImage(this.image, 0, 0);
     try {
-      photo = context.getImageData(0, 0, width, height).data;
+      return context.getImageData(0, 0, width, height);
     } catch {
-      this.psnr.textContent = 'not for local files';
-      return;
+      return null;
     }
-    const { engine } = app;
-    const shot = resizeCamera(view, width, height);
-    engine.setTime(view.code);
-    const render = engine.pixels(shot, 0.3 * (height / view.size[1]) ** 2, true);
-    this.psnr.textContent = `${psnrOf(render, photo).toFixed(2)} dB`;
-    this.psnr.dataset.value = 'some';
   }
 }
 

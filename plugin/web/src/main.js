@@ -11,6 +11,7 @@ import { compareCommands, Comparison, ViewIndex } from './compare.js';
 import { Overlay, overlayCommands } from './overlay.js';
 
 /** @typedef {import('./types.js').Camera} Camera */
+/** @typedef {import('./types.js').Picked} Picked */
 /** @typedef {import('./page.js').App} App */
 /** @typedef {import('./page.js').State} State */
 /** @typedef {import('./page.js').Command} Command */
@@ -22,7 +23,7 @@ const LOW_PASS = 0.3;
 const LONGEST_STEP = 0.1;
 const NOTE_TIME = 2500;
 const STATISTICS_INTERVAL = 250;
-const LOOK_KEYS = ['mode', 'tint', 'hidden', 'isolated', 'selected'];
+const LOOK_KEYS = ['mode', 'tint', 'hidden', 'isolated', 'selected', 'compare'];
 
 /**
  * @param {SceneDocument} scene
@@ -97,13 +98,13 @@ class ScenePage {
     followObject(this);
     new ObjectList(this);
     new Details(this);
-    const comparison = new Comparison(this, this.views);
+    this.comparison = new Comparison(this, this.views);
     this.commands = [
       ...playerCommands(this, this.player),
       ...cameraCommands(this),
       ...objectCommands(this),
       ...this.lookCommands(),
-      ...compareCommands(this, comparison),
+      ...compareCommands(this, this.comparison),
       ...overlayCommands(this),
       ...this.pageCommands(),
     ];
@@ -197,7 +198,8 @@ class ScenePage {
   }
 
   applyLook() {
-    const { mode, tint, selected } = this.state;
+    const { mode, tint, compare } = this.state;
+    const selected = compare === 'render' ? this.state.selected : -1;
     this.engine.setLook({ mode, tint: tint ? TINT : 0, visible: shownNodes(this.state), selected });
   }
 
@@ -222,11 +224,27 @@ class ScenePage {
    * @param {number} y CSS pixels.
    */
   choose(x, y) {
-    const { clientWidth: width } = this.picture;
-    const scale = this.shot().size[0] / width;
+    const scale = this.pixelScale();
     const camera = this.overlay?.cameraAtPixel(x * scale, y * scale) ?? -1;
-    if (camera >= 0) this.set({ camera, cameraCode: this.state.code });
-    else selectAt(this, x, y, width);
+    if (camera >= 0) this.comparison?.lookThrough(camera);
+    else selectAt(this, x, y);
+  }
+
+  /** @returns {number} Pixels of the drawing per CSS pixel of the picture. */
+  pixelScale() {
+    return this.shot().size[0] / this.picture.clientWidth;
+  }
+
+  /**
+   * What is seen at a place of the picture.
+   * @param {number} x CSS pixels.
+   * @param {number} y CSS pixels.
+   * @returns {Picked}
+   */
+  pick(x, y) {
+    const scale = this.pixelScale();
+    this.engine.setTime(this.code());
+    return this.engine.pick(this.shot(), this.lowPass(), x * scale, y * scale);
   }
 
   /** @param {number} time Milliseconds. */

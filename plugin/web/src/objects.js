@@ -435,19 +435,14 @@ function toggleHidden(app, index) {
 }
 
 /**
- * Selects what is seen at a pixel of the picture.
+ * Selects what is seen at a place of the picture.
  * @param {App} app
  * @param {number} x CSS pixels.
  * @param {number} y CSS pixels.
- * @param {number} width Width of the picture in CSS pixels.
  */
-export function selectAt(app, x, y, width) {
-  const shot = app.shot();
-  const scale = shot.size[0] / width;
-  const { node } = app.engine.pick(shot, app.lowPass(), x * scale, y * scale);
-  const background = app.scene.nodes[node]?.kind === 'background';
-  app.set({ selected: background ? -1 : node });
-  app.redraw();
+export function selectAt(app, x, y) {
+  const { node } = app.pick(x, y);
+  app.set({ selected: app.scene.nodes[node]?.kind === 'background' ? -1 : node });
 }
 
 /**
@@ -482,6 +477,10 @@ export function objectCommands(app) {
   const chosen = () => state.selected >= 0;
   const all = () => app.set({ hidden: state.hidden.map(() => false), isolated: -1 });
   const isolate = () => app.set({ isolated: state.isolated === state.selected ? -1 : state.selected });
+  const leave = () => {
+    if (state.camera >= 0) app.set({ camera: -1, compare: 'render', mask: false });
+    else app.set({ selected: -1, follow: false });
+  };
   const follow = () => {
     app.leaveCamera();
     app.set({ follow: !state.follow });
@@ -527,14 +526,8 @@ export function objectCommands(app) {
       key: 'g',
       enabled: chosen,
       run: follow,
-      on: () => state.follow,
+      on: () => chosen() && state.follow,
     },
-    {
-      id: 'unselect',
-      group,
-      name: 'Select nothing',
-      key: 'Escape',
-      run: () => app.set({ selected: -1, follow: false }),
-    },
+    { id: 'leave', group, name: 'Leave the recorded camera, or select nothing', key: 'Escape', run: leave },
   ];
 }

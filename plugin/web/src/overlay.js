@@ -194,8 +194,8 @@ export class Overlay {
     this.frusta = [];
     if (state.cameras) this.drawCameras(lines, code);
     if (state.selected < 0) return;
-    if (state.path) this.drawPath(lines, code);
     if (state.box && engine.isVisible(state.selected, code)) this.drawBox(lines, code);
+    if (state.path) this.drawPath(lines, code);
     if (state.joints) this.drawJoints(lines, code);
     if (state.axes) this.drawAxes(lines, code);
   }

@@ -2,6 +2,7 @@
 
 /** @typedef {import('./types.js').Document} SceneDocument */
 /** @typedef {import('./types.js').Camera} Camera */
+/** @typedef {import('./types.js').Picked} Picked */
 /** @typedef {import('./engine.js').Engine} Engine */
 /** @typedef {import('./view_camera.js').ViewCamera} ViewCamera */
 
@@ -58,6 +59,7 @@
  * @property {() => Camera} shot The camera that is drawn, in device pixels.
  * @property {() => number} lowPass That of {@link App.shot}.
  * @property {() => number} code The time that is drawn.
+ * @property {(x: number, y: number) => Picked} pick What is seen at CSS pixels of the picture.
  * @property {() => void} leaveCamera Goes to the free camera at the place of the present one.
  * @property {(text: string) => void} say Shows a short message.
  */

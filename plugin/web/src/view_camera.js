@@ -487,13 +487,9 @@ export class CameraControls {
   centre(event) {
     if (this.held) return;
     const { app } = this;
-    const shot = app.shot();
-    const scale = shot.size[0] / this.picture.clientWidth;
     const area = this.picture.getBoundingClientRect();
-    const x = (event.clientX - area.left) * scale;
-    const { point } = app.engine.pick(shot, app.lowPass(), x, (event.clientY - area.top) * scale);
+    const { point } = app.pick(event.clientX - area.left, event.clientY - area.top);
     if (point) this.change(() => app.viewCamera.turnTo(point));
-    app.redraw();
   }
 
   /**

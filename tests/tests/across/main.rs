@@ -23,6 +23,7 @@ mod recorded_motion;
 mod reference;
 mod render_memory;
 mod unfinished_capture;
+mod view;
 mod vision;
 mod where_is_it;
 mod whole_path;

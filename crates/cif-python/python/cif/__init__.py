@@ -13,6 +13,7 @@ Captures, trained scenes and stages are also here as objects with numpy arrays::
     field.export("table.usdc")
     edited, changes = cif.import_scene("table.usdc", base=field)
     cif.query_stage("table.usdc", "red mug", time_code=12)
+    cif.view(field, capture="captures/table")
 """
 
 from __future__ import annotations
@@ -38,12 +39,14 @@ from ._native import (
     train,
     usd_version,
 )
+from ._view import Page, view
 
 __all__ = [
     "Camera",
     "CifError",
     "Dataset",
     "Field",
+    "Page",
     "Picture",
     "__version__",
     "diff",
@@ -54,6 +57,7 @@ __all__ = [
     "run",
     "train",
     "usd_version",
+    "view",
 ]
 
 cif4d.warn()

@@ -2,6 +2,7 @@
 
 mod budget;
 mod report;
+mod watch;
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -26,6 +27,7 @@ use crate::progress::Progress;
 use crate::settings::Layers;
 use crate::{endings, interrupt, starting_points, training};
 use budget::{Goals, Timing};
+use watch::{Opening, Watch};
 
 /// Train a scene on a capture
 #[derive(Debug, Args)]
@@ -95,6 +97,10 @@ pub(super) struct Train {
     /// Log of the run: every event as a line of JSON, as it happens; --json is the report at the end
     #[arg(long, value_name = "FILE.jsonl", value_parser = endings::log())]
     log: Option<PathBuf>,
+    /// Show the scene in a browser while it is trained, with the curve of its quality and a button that stops and saves;
+    /// --view=address prints the address only. At most 3% of the time go there, and none while nobody looks
+    #[arg(long, value_name = "HOW", num_args = 0..=1, require_equals = true, default_missing_value = "open")]
+    view: Option<Opening>,
     #[command(flatten)]
     report: crate::report::Report,
     /// Look at every array of every step, and name the part, the tensor and the index of the first value that
@@ -218,10 +224,18 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
         interrupt::set_last_words("interrupted; the saved state is as it was");
     }
     let progress = Arc::new(Mutex::new(Progress::new(command.quiet)));
-    let phases = timing.phases(Stop::when(interrupt::requested)).reported_to({
-        let progress = Arc::clone(&progress);
+    let watch = command.view.map(|opening| Watch::start(&command.output, opening)).transpose()?;
+    let stop = Stop::when({
+        let watch = watch.clone();
+        move || interrupt::requested() || watch.as_ref().is_some_and(|watch| watch.is_stopped())
+    });
+    let phases = timing.phases(stop).reported_to({
+        let (progress, watch) = (Arc::clone(&progress), watch.clone());
         move |event| {
             shown(&progress).event(event);
+            if let Some(watch) = &watch {
+                watch.phase(event);
+            }
             Control::Continue
         }
     });
@@ -304,7 +318,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     }
 
     shown(&progress).log_to(command.log.as_deref(), command.resume)?;
-    train(command, &timing, trainer, &mut destination, &progress)
+    train(command, &timing, trainer, &mut destination, &progress, watch.as_deref())
 }
 
 /// Runs a trainer to its end, or until it is stopped, and reports the result.
@@ -314,15 +328,23 @@ fn train(
     mut trainer: Trainer,
     destination: &mut Destination,
     progress: &Mutex<Progress>,
+    watch: Option<&Watch>,
 ) -> Result<(), Error> {
     interrupt::watch_and_save();
     let mut steps_done = StepCount::default();
-    let outcome = training::run(&mut trainer, Some(destination), &mut |event| {
+    let outcome = training::run(&mut trainer, Some(destination), &mut |event, view| {
         shown(progress).event(event);
+        if let Some((watch, view)) = watch.zip(view) {
+            watch.event(event, view);
+        }
+        let stops = watch.is_some_and(Watch::is_stopped);
         let enough = command.stop_after.is_some_and(|limit| steps_done.after(event) >= limit);
-        if enough { Control::Stop } else { Control::Continue }
+        if enough || stops { Control::Stop } else { Control::Continue }
     });
     let logged = shown(progress).finish(trainer.steps_done(), &trainer.wall_s_by_phase());
+    if let Some(watch) = watch {
+        watch.end(outcome.is_ok(), &trainer);
+    }
     let outcome = outcome?;
     if command.goals.changes_steps() && !command.quiet {
         command.goals.report(timing, &trainer);

@@ -12,7 +12,8 @@ use crate::commands::shared::CaptureOptions;
 use crate::error::Error;
 use crate::interrupt;
 use crate::messages::{note, outcome, warning};
-use server::Server;
+pub(super) use server::Server;
+pub(super) use shown::Shown;
 
 /// Look at a scene, an exported file or a capture in a browser
 #[derive(Debug, Args)]
@@ -56,7 +57,7 @@ pub(super) fn run(command: &View) -> Result<(), Error> {
     }
     note!("only this machine can see the page; Ctrl-C ends it");
     interrupt::watch();
-    server.serve();
+    server.serve(interrupt::requested);
     outcome!("the page is closed");
     Ok(())
 }

@@ -1,13 +1,17 @@
 //! The server of a page: for this machine, and for those who know the address.
 
 use std::net::{Ipv4Addr, SocketAddr};
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 use tiny_http::{Header, Method, Request, Response};
 
+use cif_web::Page;
+
+use super::images::Images;
 use super::shown::Shown;
 use crate::error::Error;
-use crate::interrupt;
 use crate::messages::warning;
 
 /// Threads that answer: as many as browsers ask at a time for images of one page.
@@ -16,8 +20,11 @@ const THREADS: usize = 6;
 /// Time after which a thread looks whether it shall stop.
 const PATIENCE: Duration = Duration::from_millis(150);
 
+/// Time without a question after which nobody looks any more: pages ask once a second.
+const WATCHED: Duration = Duration::from_secs(5);
+
 /// A page and its data at an address of its own.
-pub(super) struct Server {
+pub(in crate::commands) struct Server {
     http: tiny_http::Server,
     port: u16,
     /// What must begin every path: nobody guesses it, and pages of other origins do not know it.
@@ -28,9 +35,20 @@ pub(super) struct Server {
 /// All that the server tells.
 struct Content {
     page: cif_web::assets::Html,
-    scene: Vec<u8>,
+    scene: Mutex<Scene>,
+    images: Option<Images>,
+    /// True after the page has asked to stop what it watches.
+    is_stopped: AtomicBool,
+    /// When a page has asked last how far the run is.
+    asked: Mutex<Option<Instant>>,
+}
+
+/// What a page shows now.
+struct Scene {
+    document: Vec<u8>,
     bytes: Vec<u8>,
-    images: Option<super::images::Images>,
+    /// How far a run is that the page watches; `None` where the scene stays as it is.
+    status: Option<Vec<u8>>,
 }
 
 /// An answer: status, kind of content and bytes.
@@ -41,7 +59,7 @@ impl Server {
     ///
     /// # Errors
     /// When the port is taken.
-    pub(super) fn start(shown: Shown, port: u16) -> Result<Self, Error> {
+    pub(in crate::commands) fn start(shown: Shown, port: u16) -> Result<Self, Error> {
         let http = tiny_http::Server::http((Ipv4Addr::LOCALHOST, port)).map_err(|error| {
             Error::failed(
                 format!("no page can be served at port {port} of this machine: {error}"),
@@ -50,26 +68,59 @@ impl Server {
         })?;
         let port = http.server_addr().to_ip().as_ref().map_or(port, SocketAddr::port);
         let token = format!("{:032x}", rand::random::<u128>());
+        let (page, images) = shown.into_parts();
         let content = Content {
-            page: cif_web::assets::html(&shown.page.document.title, ""),
-            scene: serde_json::to_vec(&shown.page.document).map_err(Error::plain)?,
-            bytes: shown.page.bytes,
-            images: shown.images,
+            page: cif_web::assets::html(&page.document.title, ""),
+            scene: Mutex::new(Scene {
+                document: serde_json::to_vec(&page.document).map_err(Error::plain)?,
+                bytes: page.bytes,
+                status: None,
+            }),
+            images,
+            is_stopped: AtomicBool::new(false),
+            asked: Mutex::new(None),
         };
         Ok(Self { http, port, token, content })
     }
 
     /// The address of the page.
-    pub(super) fn address(&self) -> String {
+    pub(in crate::commands) fn address(&self) -> String {
         format!("http://127.0.0.1:{}/{}/", self.port, self.token)
     }
 
-    /// Answers until the command is asked to stop.
-    pub(super) fn serve(&self) {
+    /// Shows another state of the scene, at the next status that says so.
+    ///
+    /// # Errors
+    /// None but those of JSON, which documents do not have.
+    pub(in crate::commands) fn show(&self, page: Page) -> Result<(), Error> {
+        let document = serde_json::to_vec(&page.document).map_err(Error::plain)?;
+        let mut scene = self.content.scene();
+        (scene.document, scene.bytes) = (document, page.bytes);
+        Ok(())
+    }
+
+    /// Tells how far the run is that the page watches, JSON.
+    pub(in crate::commands) fn tell(&self, status: Vec<u8>) {
+        self.content.scene().status = Some(status);
+    }
+
+    /// True after the page has asked to stop.
+    pub(in crate::commands) fn is_stopped(&self) -> bool {
+        self.content.is_stopped.load(Ordering::Relaxed)
+    }
+
+    /// True while a page asks how far the run is.
+    pub(in crate::commands) fn is_watched(&self) -> bool {
+        let asked = *self.content.asked.lock().unwrap_or_else(PoisonError::into_inner);
+        asked.is_some_and(|asked| asked.elapsed() < WATCHED)
+    }
+
+    /// Answers until it `is_over`.
+    pub(in crate::commands) fn serve(&self, is_over: impl Fn() -> bool + Sync) {
         std::thread::scope(|scope| {
             for _ in 0..THREADS {
                 scope.spawn(|| {
-                    while !interrupt::requested() {
+                    while !is_over() {
                         if let Ok(Some(request)) = self.http.recv_timeout(PATIENCE) {
                             self.answer(request);
                         }
@@ -104,13 +155,24 @@ impl Server {
         let Some(inside) = inside.and_then(|path| path.strip_prefix('/')) else {
             return text(403, "the address is not complete: take the one that cif view printed");
         };
+        if *method == Method::Post && inside == "stop" && self.content.scene().status.is_some() {
+            self.content.is_stopped.store(true, Ordering::Relaxed);
+            return text(200, "the run stops and saves");
+        }
         if !matches!(method, Method::Get | Method::Head) {
             return text(405, "nothing is written here");
         }
         match inside {
             "" => (200, "text/html; charset=utf-8", self.content.page.text.clone().into_bytes()),
-            "scene.json" => (200, "application/json", self.content.scene.clone()),
-            "scene.bin" => (200, "application/octet-stream", self.content.bytes.clone()),
+            "scene.json" => (200, "application/json", self.content.scene().document.clone()),
+            "scene.bin" => (200, "application/octet-stream", self.content.scene().bytes.clone()),
+            "status.json" => {
+                *self.content.asked.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
+                match &self.content.scene().status {
+                    Some(status) => (200, "application/json", status.clone()),
+                    None => text(404, "nothing goes on here"),
+                }
+            }
             address => match self.content.images.as_ref().and_then(|images| images.at(address)) {
                 Some(Ok(picture)) => (200, "image/png", picture),
                 Some(Err(error)) => {
@@ -136,6 +198,12 @@ impl Server {
             ("Cross-Origin-Opener-Policy", "same-origin"),
         ];
         pairs.iter().filter_map(|(name, value)| Header::from_bytes(*name, *value).ok()).collect()
+    }
+}
+
+impl Content {
+    fn scene(&self) -> MutexGuard<'_, Scene> {
+        self.scene.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

@@ -23,9 +23,21 @@ use crate::pictures::instance_color;
 const FRAMES_PER_SECOND: f64 = 24.0;
 
 /// A page, and the images that it asks for.
-pub(super) struct Shown {
-    pub(super) page: Page,
-    pub(super) images: Option<Images>,
+pub(in crate::commands) struct Shown {
+    page: Page,
+    images: Option<Images>,
+}
+
+impl Shown {
+    /// A page, with the images of a capture.
+    pub(in crate::commands) fn of(page: Page, dataset: Option<Dataset>) -> Self {
+        Self { page, images: dataset.map(Images::of) }
+    }
+
+    /// The page, and what answers for its images.
+    pub(super) fn into_parts(self) -> (Page, Option<Images>) {
+        (self.page, self.images)
+    }
 }
 
 /// Opens whatever a path names.
@@ -56,11 +68,22 @@ pub(super) fn open(path: &Path, capture: Option<&Path>, options: &CaptureOptions
         warning!("{warning}");
     }
     let mut page = describe(&graph, &formats::name_of(path), &paths, instance_color);
+    page.document.stage = stage(path, &graph);
     let Some(capture) = capture else { return Ok(Shown { page, images: None }) };
     let dataset = of_scene(capture, options, &graph, field.as_ref())?;
     let codes = &graph.time_codes;
     page.document.views = views(&dataset, |frame| code_at(&codes.times, &codes.samples, frame.time));
     Ok(Shown { page, images: Some(Images::of(dataset)) })
+}
+
+/// The stage that edits of a page are a layer over: the one that is shown, or the one that a scene is exported as. Other
+/// files hold no prims, and of stages of others nobody knows how their prims are placed.
+fn stage(path: &Path, graph: &SceneGraph) -> Option<String> {
+    if formats::is_field(path) {
+        return Some(formats::name_of(&path.with_extension("usda")));
+    }
+    let is_usd = formats::format_of(path).is_ok_and(|format| format.about().key == "usd");
+    (is_usd && graph.origin.field_fingerprint.is_some()).then(|| formats::name_of(path))
 }
 
 /// Paths of prims as the file has them, by the names of its nodes; formats that call them otherwise are asked, and none
@@ -131,6 +154,8 @@ fn of_capture(dataset: Dataset, title: &str) -> Shown {
         nodes: vec![node],
         cameras: cameras.into_iter().map(camera).collect(),
         views: views(&dataset, |frame| frame.time_index as f64),
+        stage: None,
+        live: false,
     };
     Shown { page: Page { document, bytes }, images: Some(Images::of(dataset)) }
 }
