@@ -34,7 +34,7 @@ BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13 b
 # One interpreter for every build, or PyO3 is built again.
 export PYO3_PYTHON := $(abspath $(BIN)/python)
 
-.PHONY: help build wheel demo plugin stubs docs test test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-simready test-blender test-capture fuzz lint lint-format format clean
+.PHONY: help build wheel demo plugin stubs docs test test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-simready test-blender test-capture fuzz lint lint-format lint-page format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
@@ -51,6 +51,7 @@ help:
 	@echo "make stubs   docstrings of the Python module into its stub"
 	@echo "make docs    the pages of docs/reference, generated from the code"
 	@echo "make lint    formatting and lints, as in CI"
+	@echo "make lint-page   types of the page's script; needs node, TypeScript is downloaded"
 	@echo "make format  put the formatting right"
 
 $(BIN)/python:
@@ -185,6 +186,11 @@ lint-format: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	cargo fmt --all --check
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+# The types of the page's script, with node and TypeScript from npm.
+lint-page:
+	npx --yes --package typescript@5.9.3 tsc --noEmit --checkJs --strict --target es2022 --module es2022 \
+		--lib es2022,dom,dom.iterable --moduleResolution bundler plugin/web/src/*.js
 
 stubs: # after make test-wheel
 	$(TEST_BIN)/python crates/cif-python/stubs.py

@@ -15,19 +15,21 @@ const SKELETON: &str = file!("index.html");
 const STYLE: &str = file!("style.css");
 
 /// Modules of the script; each imports from those above it only.
-const MODULES: [&str; 13] = [
+const MODULES: [&str; 15] = [
     file!("src/math.js"),
     file!("src/arrays.js"),
     file!("src/motion.js"),
     file!("src/sort.js"),
     file!("src/shaders.js"),
     file!("src/engine.js"),
+    file!("src/page.js"),
     file!("src/view_camera.js"),
-    file!("src/overlay.js"),
     file!("src/player.js"),
     file!("src/objects.js"),
     file!("src/compare.js"),
-    file!("src/page.js"),
+    file!("src/overlay.js"),
+    file!("src/edits.js"),
+    file!("src/live.js"),
     file!("src/main.js"),
 ];
 

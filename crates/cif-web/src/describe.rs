@@ -26,6 +26,12 @@ pub struct Page {
 }
 
 impl Page {
+    /// A document with its bytes.
+    #[must_use]
+    pub fn of(document: Document, bytes: Vec<u8>) -> Self {
+        Self { document: Document { bytes: bytes.len(), ..document }, bytes }
+    }
+
     /// A page of a run that has nothing to show yet.
     #[must_use]
     pub fn empty(title: &str) -> Self {
@@ -43,6 +49,7 @@ impl Page {
             cameras: Vec::new(),
             views: Vec::new(),
             stage: None,
+            bytes: 0,
             live: true,
         };
         Self { document, bytes: Vec::new() }
@@ -92,9 +99,10 @@ pub fn describe(
         cameras: graph.cameras.iter().map(camera).collect(),
         views: Vec::new(),
         stage: None,
+        bytes: 0,
         live: false,
     };
-    Page { document, bytes: block.into_bytes() }
+    Page::of(document, block.into_bytes())
 }
 
 /// Cosine of the angle between the declared axis and the mean up direction of cameras from which on the cameras decide:
@@ -265,7 +273,7 @@ fn splats(splats: &GraphSplats, block: &mut Block) -> Splats {
         centres: block.exact(splats.means.as_flattened()),
         orientations: block.fine(splats.orientations.as_flattened()),
         scales: block.rounded(splats.scales.as_flattened()),
-        opacities: block.rounded(&splats.opacities),
+        opacities: block.exact(&splats.opacities),
         degree: splats.sh_degree,
         base: block.rounded(&of(0..3)),
         higher: (splats.sh_degree > 0).then(|| block.coarse(&of(3..row))),

@@ -38,6 +38,8 @@ pub struct Document {
     pub views: Vec<View>,
     /// Stage that edits are a layer over; `None` where none holds the nodes at their paths.
     pub stage: Option<String>,
+    /// Length of the block of bytes.
+    pub bytes: usize,
     /// True when the page shall ask how far the run is that the scene comes from.
     pub live: bool,
 }

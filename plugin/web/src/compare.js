@@ -10,6 +10,8 @@ import { isCapture, resizeCamera } from './view_camera.js';
 
 const KEPT_IMAGES = 48;
 const PSNR_DELAY = 300;
+/** @type {null[]} */
+const NO_RATIOS = [];
 /** @type {Record<Compared, string>} */
 const COMPARE_NAMES = {
   render: 'Render alone',
@@ -105,6 +107,32 @@ export function psnrOf(a, b) {
   return 10 * Math.log10((255 * 255 * 0.75 * a.length) / sum);
 }
 
+/** Largest difference of a colour of a mask, which was drawn through, from that of its instance. */
+const SAME_COLOR = 4;
+
+/**
+ * Peak signal-to-noise ratio over the pixels of each node in a mask, decibels; null where there are none.
+ * @param {ArrayLike<number>} a RGBA.
+ * @param {ArrayLike<number>} b RGBA.
+ * @param {ArrayLike<number>} mask RGBA, in the colours of instances.
+ * @param {import('./types.js').Node[]} nodes
+ * @returns {(number | null)[]}
+ */
+export function ratiosOf(a, b, mask, nodes) {
+  const sums = nodes.map(() => 0);
+  const counts = nodes.map(() => 0);
+  for (let i = 0; i < mask.length; i += 4) {
+    if (!mask[i + 3]) continue;
+    const isNear = (/** @type {number} */ value, /** @type {number} */ k) =>
+      Math.abs(value - mask[i + k]) <= SAME_COLOR;
+    const node = nodes.findIndex(({ id, color }) => id !== null && color.every(isNear));
+    if (node < 0) continue;
+    sums[node] += (a[i] - b[i]) ** 2 + (a[i + 1] - b[i + 1]) ** 2 + (a[i + 2] - b[i + 2]) ** 2;
+    counts[node] += 3;
+  }
+  return sums.map((sum, k) => (counts[k] ? 10 * Math.log10((255 * 255 * counts[k]) / sum) : null));
+}
+
 /** The panel of cameras, and the images over the picture. */
 export class Comparison {
   /**
@@ -119,6 +147,8 @@ export class Comparison {
     this.mask = byId('mask', HTMLCanvasElement);
     /** @type {Map<View, string>} */
     this.ratios = new Map();
+    /** By node. @type {Map<View, (number | null)[]>} */
+    this.ratiosOfNodes = new Map();
     this.photo = document.createElement('canvas');
     this.psnr = byId('psnr', HTMLOutputElement);
     this.camera = byId('camera', HTMLSelectElement);
@@ -304,6 +334,11 @@ export class Comparison {
     const known = view && this.ratios.get(view);
     this.psnr.dataset.value = known ? 'some' : 'none';
     this.psnr.textContent = known ?? this.missingRatio();
+    const ratios = (known && view && this.ratiosOfNodes.get(view)) || NO_RATIOS;
+    if (ratios !== this.app.ratios) {
+      this.app.ratios = ratios;
+      this.app.tell('ratios');
+    }
     const ready = view && view === this.drawn && !known && !this.app.state.playing;
     if (ready && !isCapture(this.app.scene))
       this.timer = window.setTimeout(() => this.measure(view), PSNR_DELAY);
@@ -319,24 +354,32 @@ export class Comparison {
   /** @param {View} view */
   measure(view) {
     const { engine } = this.app;
-    const photo = this.readImage();
+    const photo = this.read(this.image);
     if (photo) {
       engine.setTime(view.code);
       const shot = resizeCamera(view, photo.width, photo.height);
       const render = engine.pixels(shot, 0.3 * (photo.height / view.size[1]) ** 2, true);
       this.ratios.set(view, `${psnrOf(render, photo.data).toFixed(2)} dB`);
+      const mask = view.mask && this.read(this.mask);
+      if (mask && mask.width === photo.width && mask.height === photo.height) {
+        this.ratiosOfNodes.set(view, ratiosOf(render, photo.data, mask.data, this.app.scene.nodes));
+      }
     } else {
       this.ratios.set(view, 'not for local files');
     }
     this.showRatio();
   }
 
-  /** @returns {ImageData | null} Pixels of the image; null where the page may not read them. */
-  readImage() {
-    const { width, height } = this.image;
+  /**
+   * Pixels of a canvas; null where the page may not read them.
+   * @param {HTMLCanvasElement} canvas
+   * @returns {ImageData | null}
+   */
+  read(canvas) {
+    const { width, height } = canvas;
     Object.assign(this.photo, { width, height });
     const context = context2d(this.photo, true);
-    context.drawImage(this.image, 0, 0);
+    context.drawImage(canvas, 0, 0);
     try {
       return context.getImageData(0, 0, width, height);
     } catch {

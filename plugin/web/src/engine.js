@@ -1,5 +1,6 @@
 // Draws a document of animated splats to a canvas.
 
+import { decodeArray } from './arrays.js';
 import { inverse, normalizeQuaternion, toRotation, transformPoint, turnOf } from './math.js';
 import { HarmonicsPacker, SplatPlacement, harmonicsTexels } from './motion.js';
 import { isVisibleAt, partPoseAt, poseAt } from './motion.js';
@@ -456,6 +457,13 @@ export class Engine {
     }
   }
 
+  /** Takes poses of the document that were changed. */
+  refresh() {
+    const { code } = this;
+    this.code = Number.NaN;
+    this.setTime(code);
+  }
+
   /**
    * Goes to a time code.
    * @param {number} code
@@ -466,6 +474,61 @@ export class Engine {
     const { changes, moved } = this.placement.setTime(code);
     for (const change of changes) this.textures.write(change);
     if (moved) this.version++;
+  }
+
+  /**
+   * Erases splats of a node in place of those that were erased before.
+   * @param {number} node
+   * @param {Set<number>} splats Places among the splats of the node.
+   */
+  erase(node, splats) {
+    this.placement.erase(node, splats);
+    this.textures.write({ node, centres: true, turns: false, sizes: false, harmonics: false });
+    this.version++;
+  }
+
+  /**
+   * Opacities of the splats of a node as the document has them, at each of their samples.
+   * @param {number} node
+   * @returns {{ code: number, values: Float32Array }[]}
+   */
+  opacities(node) {
+    const { bytes } = this.placement;
+    const { opacities, splats } = this.document.nodes[node];
+    const { start } = this.document.timeline;
+    if (!opacities) return [{ code: start, values: decodeArray(bytes, splats.opacities) }];
+    const all = decodeArray(bytes, opacities.values);
+    return opacities.codes.map((code, k) => {
+      return { code, values: all.slice(k * splats.count, (k + 1) * splats.count) };
+    });
+  }
+
+  /**
+   * Splats of a node whose centres are seen near a pixel, whatever is in front of them.
+   * @param {Camera} shot
+   * @param {number} node
+   * @param {number[]} pixel
+   * @param {number} radius Pixels.
+   * @returns {number[]} Places among the splats of the node.
+   */
+  splatsNear(shot, node, pixel, radius) {
+    const { ranges, centres, firsts } = this.placement;
+    this.aim(shot, this.look);
+    const found = [];
+    for (const { first, count, rows } of ranges.filter((range) => range.node === node)) {
+      for (let splat = first; splat < first + count; splat++) {
+        const [x, y, z] = [0, 4, 8].map(
+          (row) =>
+            rows[row] * centres[4 * splat] + rows[row + 1] * centres[4 * splat + 1]
+            + rows[row + 2] * centres[4 * splat + 2] + rows[row + 3],
+        );
+        if (z < this.near()) continue;
+        const right = (shot.focal[0] * x) / z + shot.principal[0] - pixel[0];
+        const down = (shot.focal[1] * y) / z + shot.principal[1] - pixel[1];
+        if (Math.hypot(right, down) <= radius) found.push(splat - firsts[node]);
+      }
+    }
+    return found;
   }
 
   /**

@@ -9,6 +9,8 @@ import { Details, formatCount, objectCommands, ObjectList } from './objects.js';
 import { followObject, selectAt, shownNodes } from './objects.js';
 import { compareCommands, Comparison, ViewIndex } from './compare.js';
 import { Overlay, overlayCommands } from './overlay.js';
+import { editCommands, Edits } from './edits.js';
+import { LiveRun } from './live.js';
 
 /** @typedef {import('./types.js').Camera} Camera */
 /** @typedef {import('./types.js').Picked} Picked */
@@ -53,6 +55,7 @@ function initialState(scene) {
     compare: 'render',
     split: 0.5,
     gain: 1,
+    brush: false,
     mask: false,
     maskOpacity: 0.6,
   };
@@ -80,6 +83,10 @@ class ScenePage {
     this.listeners = [];
     /** @type {Command[]} */
     this.commands = [];
+    /** @type {Edits | null} */
+    this.edits = null;
+    /** @type {(number | null)[]} */
+    this.ratios = [];
     this.dirty = true;
     this.noteTimer = 0;
     this.lastTime = 0;
@@ -99,11 +106,14 @@ class ScenePage {
     new ObjectList(this);
     new Details(this);
     this.comparison = new Comparison(this, this.views);
+    this.edits = this.scene.stage ? new Edits(this, this.scene.stage) : null;
+    if (this.scene.live) new LiveRun(this);
     this.commands = [
       ...playerCommands(this, this.player),
       ...cameraCommands(this),
       ...objectCommands(this),
       ...this.lookCommands(),
+      ...(this.edits ? editCommands(this) : []),
       ...compareCommands(this, this.comparison),
       ...overlayCommands(this),
       ...this.pageCommands(),
@@ -136,6 +146,26 @@ class ScenePage {
     const keys = /** @type {(keyof State)[]} */ (Object.keys(patch));
     const changed = new Set(keys.filter((key) => before[key] !== this.state[key]).map(String));
     if (changed.size) for (const listener of this.listeners) listener(changed);
+  }
+
+  /**
+   * Tells the listeners of a change that the state does not hold.
+   * @param {string} key
+   */
+  tell(key) {
+    for (const listener of this.listeners) listener(new Set([key]));
+  }
+
+  /**
+   * Shows the same objects and cameras with other splats.
+   * @param {SceneDocument} scene
+   * @param {ArrayBuffer} bytes
+   */
+  replace(scene, bytes) {
+    this.scene = scene;
+    this.engine.replace(scene, bytes);
+    this.applyLook();
+    this.tell('scene');
   }
 
   /** @param {(changed: Set<string>) => void} listener */
@@ -207,6 +237,16 @@ class ScenePage {
     if (this.state.camera < 0) return;
     this.viewCamera.look(this.shot().pose, this.viewCamera.distance);
     this.set({ camera: -1, compare: 'render', mask: false });
+  }
+
+  /**
+   * Erases splats of the selected object, or brings them back.
+   * @param {number} x CSS pixels.
+   * @param {number} y CSS pixels.
+   * @param {boolean} isUndone
+   */
+  brushAt(x, y, isUndone) {
+    this.edits?.brushAt(x, y, isUndone);
   }
 
   /** @param {string} text */
@@ -365,13 +405,22 @@ function keyName(event) {
 }
 
 /**
+ * Whether an element takes text.
+ * @param {EventTarget | null} target
+ * @returns {boolean}
+ */
+function isText(target) {
+  return target instanceof HTMLInputElement && /^(search|text|number)$/.test(target.type);
+}
+
+/**
  * Whether an element has its own use for a key.
  * @param {EventTarget | null} target
  * @param {string} key
  * @returns {boolean}
  */
 function takesKey(target, key) {
-  if (target instanceof HTMLInputElement && target.type === 'search') return true;
+  if (isText(target)) return true;
   if (target instanceof HTMLSelectElement) return key !== 'Escape';
   if (target instanceof HTMLInputElement && target.type === 'range') {
     return target.id !== 'scrub' && /^(Arrow|Home|End|Page)/.test(key);
@@ -385,8 +434,7 @@ function releaseFocusAfterPointer() {
   let pointer = false;
   const release = (/** @type {Event} */ event) => {
     const control = event.target instanceof Element ? event.target.closest('button, select, input') : null;
-    const text = control instanceof HTMLInputElement && control.type === 'search';
-    if (pointer && !text && control instanceof HTMLElement) control.blur();
+    if (pointer && !isText(control) && control instanceof HTMLElement) control.blur();
   };
   document.addEventListener(
     'pointerdown',

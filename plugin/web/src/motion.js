@@ -295,6 +295,8 @@ export class SplatPlacement {
     /** Standard deviations, and the index of the range. */
     this.sizes = new Float32Array(length);
     this.motions = document.nodes.map((node) => new NodeMotion(node, bytes));
+    /** Splats that were erased, by node. @type {Map<number, Set<number>>} */
+    this.erased = new Map();
     for (const [index, node] of document.nodes.entries()) this.rest(node, this.firsts[index]);
     for (const [index, range] of this.ranges.entries()) {
       const end = range.first + range.count;
@@ -350,6 +352,30 @@ export class SplatPlacement {
   }
 
   /**
+   * Erases splats of a node in place of those that were erased before.
+   * @param {number} node
+   * @param {Set<number>} splats Places among the splats of the node.
+   */
+  erase(node, splats) {
+    const first = this.firsts[node];
+    const { opacities } = this.motions[node];
+    if (opacities) {
+      writeMixed(opacities, 1, this.centres.subarray(3), 4 * first);
+    } else {
+      const resting = decodeArray(this.bytes, this.document.nodes[node].splats.opacities);
+      for (const splat of this.erased.get(node) ?? []) this.centres[4 * (first + splat) + 3] = resting[splat];
+    }
+    this.erased.set(node, splats);
+    this.clearErased(node);
+  }
+
+  /** @param {number} node */
+  clearErased(node) {
+    const first = this.firsts[node];
+    for (const splat of this.erased.get(node) ?? []) this.centres[4 * (first + splat) + 3] = 0;
+  }
+
+  /**
    * Writes the splats of a node at a time code; null when nothing changed.
    * @param {number} node
    * @param {number} code
@@ -375,6 +401,7 @@ export class SplatPlacement {
       writeMixed(opacities, 1, this.centres.subarray(3), at);
       change.centres = true;
     }
+    if (change.centres) this.clearErased(node);
     change.harmonics = harmonics !== null && harmonics.seek(code);
     return change.centres || change.turns || change.sizes || change.harmonics ? change : null;
   }

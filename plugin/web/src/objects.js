@@ -106,12 +106,14 @@ export function posesAsCsv(app, node) {
 }
 
 /**
+ * Saves a text as a file of the user.
  * @param {string} name
  * @param {string} text
+ * @param {string} type
  */
-function saveFile(name, text) {
+export function saveFile(name, text, type) {
   const link = document.createElement('a');
-  link.href = URL.createObjectURL(new Blob([text], { type: 'text/csv' }));
+  link.href = URL.createObjectURL(new Blob([text], { type }));
   link.download = name;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
@@ -166,6 +168,15 @@ function makeEye() {
   return svg;
 }
 
+/**
+ * How many splats a node has.
+ * @param {SceneNode} node
+ * @returns {string}
+ */
+function countOf(node) {
+  return `${formatCount(node.splats.count)} ${node.kind === 'points' ? 'points' : 'splats'}`;
+}
+
 /** The list of objects. */
 export class ObjectList {
   /** @param {App} app */
@@ -183,6 +194,8 @@ export class ObjectList {
     app.listen((changed) => {
       if (['hidden', 'isolated', 'selected'].some((key) => changed.has(key))) this.show();
       if (changed.has('selected')) this.items[app.state.selected]?.scrollIntoView({ block: 'nearest' });
+      if (changed.has('scene')) this.rename();
+      if (changed.has('ratios')) this.showRatios();
     });
     this.filter();
     this.show();
@@ -197,7 +210,8 @@ export class ObjectList {
     const facts = make('span', 'facts', '', [make('span', '', node.motion)]);
     if (node.parts.length) facts.append(make('span', '', `${node.parts.length} parts`));
     facts.append(
-      make('span', '', `${formatCount(node.splats.count)} ${node.kind === 'points' ? 'points' : 'splats'}`),
+      make('span', 'count', countOf(node)),
+      make('span', 'decibels'),
     );
     if (node.rotation) {
       const badge = make('span', 'badge', `rotation ${node.rotation}`);
@@ -234,6 +248,29 @@ export class ObjectList {
       item.dataset.shown = String(shown[i]);
       item.querySelector('.item')?.setAttribute('aria-pressed', String(i === state.selected));
       item.querySelector('.eye')?.setAttribute('aria-pressed', String(shown[i]));
+    });
+  }
+
+  /** Takes labels and counts that were changed. */
+  rename() {
+    this.app.scene.nodes.forEach((node, i) => {
+      const item = this.items[i];
+      for (const [part, text] of [['.label', labelOf(node)], ['.count', countOf(node)]]) {
+        const element = item.querySelector(part);
+        if (element) element.textContent = text;
+      }
+      item.querySelector('.item')?.setAttribute('title', labelOf(node));
+      item.querySelector('.eye')?.setAttribute('aria-label', `Show ${labelOf(node)}`);
+    });
+  }
+
+  /** Shows how well each object agrees with the image that is compared. */
+  showRatios() {
+    const { ratios } = this.app;
+    this.items.forEach((item, i) => {
+      const ratio = ratios[i] ?? null;
+      const element = item.querySelector('.decibels');
+      if (element) element.textContent = ratio === null ? '' : `${ratio.toFixed(1)} dB`;
     });
   }
 
@@ -297,7 +334,7 @@ export class Details {
     this.now = make('dd', '');
     byId('csv', HTMLButtonElement).addEventListener('click', () => this.save());
     app.listen((changed) => {
-      if (changed.has('selected')) this.show();
+      if (changed.has('selected') || changed.has('scene')) this.show();
       else if (changed.has('code') || changed.has('compare') || changed.has('camera')) this.showPose();
     });
     this.show();
@@ -420,7 +457,7 @@ export class Details {
   save() {
     const { scene, state } = this.app;
     const node = scene.nodes[state.selected];
-    if (node) saveFile(`${node.name}_poses.csv`, posesAsCsv(this.app, state.selected));
+    if (node) saveFile(`${node.name}_poses.csv`, posesAsCsv(this.app, state.selected), 'text/csv');
   }
 }
 

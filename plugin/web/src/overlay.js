@@ -1,7 +1,7 @@
 // Lines over the picture: box, path, axes and joints of the selected object, cameras and the ground.
 
 import { rotate, toRotation, transformPoint, turnOf } from './math.js';
-import { byId, context2d } from './page.js';
+import { BRUSH_RADIUS, byId, context2d } from './page.js';
 import { niceStep } from './player.js';
 import { formatLengths, pivotOf } from './objects.js';
 import { addScaled, boxCorners, cameraAt, cameraCentres } from './view_camera.js';
@@ -168,6 +168,16 @@ export class Overlay {
     this.context = context2d(this.canvas);
     /** @type {Map<number, number[][]>} */
     this.paths = new Map();
+    /** Where the pointer is, CSS pixels. */
+    this.pointer = [0, 0];
+    app.listen((changed) => {
+      if (changed.has('scene')) this.paths.clear();
+    });
+    byId('picture', HTMLElement).addEventListener('pointermove', (event) => {
+      const area = byId('picture', HTMLElement).getBoundingClientRect();
+      this.pointer = [event.clientX - area.left, event.clientY - area.top];
+      if (app.state.brush) app.redraw();
+    });
     /** @type {{ camera: number, outline: number[][] }[]} */
     this.frusta = [];
     const scene = sphereOfScene(app);
@@ -193,11 +203,22 @@ export class Overlay {
     if (state.grid) this.drawGrid(lines);
     this.frusta = [];
     if (state.cameras) this.drawCameras(lines, code);
+    if (state.brush) this.drawBrush(ratio);
     if (state.selected < 0) return;
     if (state.box && engine.isVisible(state.selected, code)) this.drawBox(lines, code);
     if (state.path) this.drawPath(lines, code);
     if (state.joints) this.drawJoints(lines, code);
     if (state.axes) this.drawAxes(lines, code);
+  }
+
+  /** @param {number} ratio Device pixels per CSS pixel. */
+  drawBrush(ratio) {
+    const { context, pointer } = this;
+    context.beginPath();
+    context.arc(pointer[0] * ratio, pointer[1] * ratio, BRUSH_RADIUS * ratio, 0, 2 * Math.PI);
+    context.strokeStyle = 'white';
+    context.lineWidth = ratio;
+    context.stroke();
   }
 
   /**

@@ -31,6 +31,7 @@
  * @property {'render' | 'split' | 'difference' | 'image'} compare
  * @property {number} split Where the image ends and the render begins, 0 to 1.
  * @property {number} gain Factor of the difference.
+ * @property {boolean} brush Drags of the picture erase splats of the selected object.
  * @property {boolean} mask
  * @property {number} maskOpacity
  */
@@ -55,14 +56,21 @@
  * @property {ViewCamera} viewCamera
  * @property {(patch: Partial<State>) => void} set Changes the state and tells the listeners.
  * @property {(listener: (changed: Set<string>) => void) => void} listen
+ * @property {(key: string) => void} tell Tells of a change that the state does not hold, such as `scene`.
+ * @property {(scene: SceneDocument, bytes: ArrayBuffer) => void} replace Other splats of the same objects.
+ * @property {(number | null)[]} ratios PSNR of each node in the compared image, decibels; empty without one.
  * @property {() => void} redraw Draws in the next frame.
  * @property {() => Camera} shot The camera that is drawn, in device pixels.
  * @property {() => number} lowPass That of {@link App.shot}.
  * @property {() => number} code The time that is drawn.
  * @property {(x: number, y: number) => Picked} pick What is seen at CSS pixels of the picture.
  * @property {() => void} leaveCamera Goes to the free camera at the place of the present one.
+ * @property {(x: number, y: number, isUndone: boolean) => void} brushAt Erases or brings back at CSS pixels.
  * @property {(text: string) => void} say Shows a short message.
  */
+
+/** Radius of the brush, CSS pixels. */
+export const BRUSH_RADIUS = 18;
 
 /** A failure with a text for the user. */
 export class PageError extends Error {}
@@ -151,6 +159,9 @@ export async function loadScene() {
     ? parseScene(inside.textContent ?? '')
     : parseScene(await (await request('scene.json')).text());
   const bytes = inside ? await unpackBytes() : await readWithProgress(await request('scene.bin'));
+  if (bytes.byteLength !== scene.bytes) {
+    throw new PageError('The splats do not belong to the description of the scene. Reload the page.');
+  }
   return { scene, bytes };
 }
 
@@ -178,7 +189,7 @@ function parseScene(text) {
  * @param {string} address
  * @returns {Promise<Response>}
  */
-async function request(address) {
+export async function request(address) {
   let response;
   try {
     response = await fetch(address);

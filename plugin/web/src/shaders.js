@@ -174,7 +174,7 @@ void main() {
     }
     if (!(color.r + color.g + color.b < 1e30)) return;
     color = min(color, 6e4);
-    if (owner.w > 1.5) color = 1.15 * mix(color, owner.rgb, 0.35) + 0.08;
+    if (owner.w > 1.5) color = mix(color, owner.rgb, 0.18) + 0.06;
   }
   float l00 = sqrt(c11 / determinant);
   place = floatBitsToUint(vec4(mean, l00, -l00 * sharp.y / c11));

@@ -150,7 +150,10 @@
  * @property {Timeline} timeline The times that are played.
  * @property {Node[]} nodes Objects, and the background last.
  * @property {RecordedCamera[]} cameras Recorded cameras.
- * @property {View[]} views Images of the capture.
+ * @property {View[]} views
+ * @property {string | null} stage Stage that edits are a layer over.
+ * @property {number} bytes Length of the block.
+ * @property {boolean} live The scene comes from a run that goes on. Images of the capture.
  */
 
 /**

@@ -428,8 +428,15 @@ export class CameraControls {
     const before = this.spread();
     last.x = event.clientX;
     last.y = event.clientY;
-    if (this.held) this.dragSplit(event);
+    if (this.app.state.brush && event.buttons === 1) this.brush(event);
+    else if (this.held) this.dragSplit(event);
     else if (right || down) this.change(() => this.dragCamera(right, down, before));
+  }
+
+  /** @param {PointerEvent} event */
+  brush(event) {
+    const area = this.picture.getBoundingClientRect();
+    this.app.brushAt(event.clientX - area.left, event.clientY - area.top, event.shiftKey);
   }
 
   /**
@@ -467,6 +474,10 @@ export class CameraControls {
     if (!this.pointers.delete(event.pointerId)) return;
     if (!this.pointers.size) delete this.picture.dataset.drag;
     if (!complete || this.moved >= CLICK_DISTANCE || event.button !== 0) return;
+    if (this.app.state.brush) {
+      this.brush(event);
+      return;
+    }
     const area = this.picture.getBoundingClientRect();
     this.choose(event.clientX - area.left, event.clientY - area.top);
   }

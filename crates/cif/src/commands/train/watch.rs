@@ -137,7 +137,7 @@ impl Watch {
         match event {
             TrainEvent::PhaseStarted { phase, total } => {
                 (status.phase, status.done, status.total) = (phase.name().to_owned(), 0, *total);
-                status.eta_s = None;
+                (status.eta_s, status.rate) = (None, None);
             }
             TrainEvent::PhaseProgress { phase, done, total, eta_s, .. } => {
                 (status.phase, status.done, status.total) = (phase.name().to_owned(), *done, *total);
@@ -161,6 +161,7 @@ impl Watch {
             TrainEvent::StageStarted { stage, iteration, iterations, gaussians } => {
                 (status.phase, status.gaussians) = (stage.to_string(), *gaussians);
                 (status.done, status.total) = (u64::from(*iteration), u64::from(*iterations));
+                self.show(&mut state, view.field());
             }
             TrainEvent::Step {
                 stage,

@@ -155,9 +155,10 @@ fn of_capture(dataset: Dataset, title: &str) -> Shown {
         cameras: cameras.into_iter().map(camera).collect(),
         views: views(&dataset, |frame| frame.time_index as f64),
         stage: None,
+        bytes: 0,
         live: false,
     };
-    Shown { page: Page { document, bytes }, images: Some(Images::of(dataset)) }
+    Shown { page: Page::of(document, bytes), images: Some(Images::of(dataset)) }
 }
 
 /// Images of a capture, with the time codes at which they were taken.
