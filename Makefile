@@ -29,12 +29,14 @@ NEWTON := newton==1.8.0 newton-usd-schemas==0.6.0 warp-lang==1.19.0 usd-core==26
 VALIDATOR := omniverse-asset-validator==1.18.0 usd-core==26.8
 SIMREADY := simready-foundation-tier-core==2026.8.0 usd-core==26.8
 PYCOLMAP := pycolmap==4.2.1
+# Drives the browser that is installed; Pillow reads its pictures.
+PLAYWRIGHT := playwright==1.65.2 pillow numpy
 BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13 bpy==5.3.0/python3.13
 
 # One interpreter for every build, or PyO3 is built again.
 export PYO3_PYTHON := $(abspath $(BIN)/python)
 
-.PHONY: help build wheel demo plugin stubs docs test test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-simready test-blender test-capture fuzz lint lint-format lint-page format clean
+.PHONY: help build wheel demo plugin stubs docs test test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-simready test-page test-blender test-capture fuzz lint lint-format lint-page format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
@@ -47,6 +49,7 @@ help:
 	@echo "make test-mujoco, test-newton, test-blender   tests with these tools, which are downloaded (75 MB, 300 MB, 1.5 GB)"
 	@echo "make test-validator   NVIDIA's validator on our stages, which is downloaded (50 MB)"
 	@echo "make test-simready   NVIDIA's SimReady features of our stages, which are downloaded (100 MB)"
+	@echo "make test-page   the page of cif view in an installed Chromium; Playwright is downloaded (50 MB)"
 	@echo "make test-capture   tests of cif capture with pycolmap, which is downloaded (50 MB), and ffmpeg where it is there"
 	@echo "make stubs   docstrings of the Python module into its stub"
 	@echo "make docs    the pages of docs/reference, generated from the code"
@@ -161,6 +164,13 @@ test-simready: test-wheel
 	test -x $(VENV)/simready/bin/python || $(PYTHON) -m venv $(VENV)/simready
 	$(VENV)/simready/bin/python -m pip install --quiet --disable-pip-version-check $(SIMREADY)
 	CIF_TEST_SIMREADY=$(VENV)/simready/bin/python $(TEST_BIN)/python -m pytest tests/python/test_simready.py
+
+# CIF_TEST_CHROMIUM names the browser, else it is searched for on the PATH; CIF_TEST_PAGE=require fails without one.
+test-page: test-wheel
+	test -x $(VENV)/page/bin/python || $(PYTHON) -m venv $(VENV)/page
+	$(VENV)/page/bin/python -m pip install --quiet --disable-pip-version-check $(PLAYWRIGHT) $(PYTEST) $(USD) $(TEST_WHEELS)/*.whl
+	$(VENV)/page/bin/python -m pip install --quiet --disable-pip-version-check --force-reinstall --no-deps $(TEST_WHEELS)/*.whl
+	$(VENV)/page/bin/python -m pytest --noconftest tests/python/test_page.py
 
 test-capture:
 	test -x $(VENV)/capture/bin/python || $(PYTHON) -m venv $(VENV)/capture

@@ -135,7 +135,9 @@ def show(browser: Browser) -> Iterator[Callable[..., Page]]:
             page.clock.install()
         page.goto(address)
         page.wait_for_selector("html[data-state]")
-        assert page.locator("html").get_attribute("data-state") == "ready", page.locator("#message").inner_text()
+        assert page.locator("html").get_attribute("data-state") == "ready", page.locator(
+            "#message"
+        ).inner_text()
         return page
 
     yield open_page
@@ -258,7 +260,9 @@ def check_pictures(page: Page, field: cif.Field, codes: list[int], last: int) ->
         expected = field.render(camera_of(shot), code / last)
         objects = expected["label"] > 0
         name = found["cameras"][0]["name"]
-        print(f"{name} {code}: {psnr(drawn, expected['color']):.1f} dB, {psnr(drawn, expected['color'], objects):.1f}")
+        print(
+            f"{name} {code}: {psnr(drawn, expected['color']):.1f} dB, {psnr(drawn, expected['color'], objects):.1f}"
+        )
 
 
 def test_pictures_are_those_of_cif(page: Page, trained: cif.Field) -> None:
@@ -391,7 +395,11 @@ def test_time(show: Callable[..., Page], served: Callable[..., str], scene: Path
     assert state(page, "code") == 1
     page.locator("#scrub").fill("36.4")
     assert state(page, "code") == 36 and page.locator("#time").inner_text().split() == [
-        "36", "/", "71", f"{36 / rate:.2f}", "s",
+        "36",
+        "/",
+        "71",
+        f"{36 / rate:.2f}",
+        "s",
     ]
     box = page.locator("#scrub").bounding_box()
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
@@ -449,7 +457,9 @@ def test_objects_are_hidden_isolated_and_tinted(page: Page, trained: cif.Field) 
     place = tuple(inside(labels, label)[0])
     press(page, "isolate")
     shown = np.abs(look() - background).max(axis=2) > 0.1
-    print("isolated", (shown & (labels != label)).sum() / (labels == label).sum(), shown[labels == label].mean())
+    print(
+        "isolated", (shown & (labels != label)).sum() / (labels == label).sum(), shown[labels == label].mean()
+    )
     assert shown[place] and page.locator("#list li[data-shown=true]").count() == 1
     press(page, "isolate", "hide")
     page.keyboard.press("Escape")
@@ -561,7 +571,9 @@ def test_recorded_cameras_and_comparisons(page: Page, trained: cif.Field) -> Non
     page.locator("#follow-time").check()
     assert shot_of(page)["pose"] == pytest.approx([s for s in camera["samples"] if s["code"] == 50][0]["pose"])
     page.locator("#scrub").fill("22")
-    (index,) = [k for k, view in enumerate(found["views"]) if (view["camera"], view["code"]) == ("camera_1", 22)]
+    (index,) = [
+        k for k, view in enumerate(found["views"]) if (view["camera"], view["code"]) == ("camera_1", 22)
+    ]
     frame = dataset.load_frame(index)
     truth = frame["image"] / 255
     render = quantized(trained.render(dataset.camera(index), 22 / 71)["color"])
@@ -616,7 +628,9 @@ def test_details_tell_what_cif_knows(page: Page, trained: cif.Field) -> None:
             assert text in body.inner_text()
         for code in (0, 36, 71):
             page.locator("#scrub").fill(str(code))
-            position, turn = (np.array(page.locator(name).inner_text().split(), float) for name in ("#position", "#turn"))
+            position, turn = (
+                np.array(page.locator(name).inner_text().split(), float) for name in ("#position", "#turn")
+            )
             assert position == pytest.approx(path["translations"][code], abs=1e-3)
             sign = np.sign(turn @ path["rotations"][code])
             assert sign * turn == pytest.approx(path["rotations"][code], abs=1e-3)
@@ -627,7 +641,9 @@ def test_details_tell_what_cif_knows(page: Page, trained: cif.Field) -> None:
             page.locator("#csv").click()
         assert download.value.suggested_filename == f"{found['instance']}_poses.csv"
         rows = list(csv.DictReader(download.value.path().read_text().splitlines()))
-        values = np.array([[float(row[name]) for name in ("time_code", "seconds", "x", "y", "z")] for row in rows])
+        values = np.array(
+            [[float(row[name]) for name in ("time_code", "seconds", "x", "y", "z")] for row in rows]
+        )
         expected = np.column_stack([path["time_codes"], path["seconds"], path["translations"]])
         assert values == pytest.approx(expected, abs=1e-4)
 
@@ -696,9 +712,7 @@ HOSTILE = [
 ]
 
 
-def test_labels_are_text(
-    show: Callable[..., Page], served: Callable[..., str], tmp_path: Path
-) -> None:
+def test_labels_are_text(show: Callable[..., Page], served: Callable[..., str], tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     count = 20 * len(HOSTILE)
     field = cif.Field.from_arrays(
@@ -743,8 +757,11 @@ def test_a_capture_before_training(show: Callable[..., Page], served: Callable[.
     press(page, "mask")
     for code in TIMES:
         page.locator("#scrub").fill(str(code))
-        (index,) = [k for k, frame in enumerate(dataset.frames)
-                    if (frame["camera_name"], frame["time_index"]) == ("camera_0", code)]
+        (index,) = [
+            k
+            for k, frame in enumerate(dataset.frames)
+            if (frame["camera_name"], frame["time_index"]) == ("camera_0", code)
+        ]
         frame = dataset.load_frame(index)
         until(lambda frame=frame: np.array_equal(canvas(page, "#image")[..., :3], frame["image"]))
         assert np.array_equal(canvas(page, "#mask")[..., 3] > 0, frame["mask"] > 0)
@@ -786,8 +803,12 @@ def test_lost_graphics(page: Page, playwright: Playwright) -> None:
     assert np.array_equal(pixels(page, None, 30), before)
 
 
-@pytest.mark.parametrize("arguments", [["--disable-3d-apis"], ["--disable-gpu", "--disable-webgl", "--disable-webgl2"]])
-def test_without_graphics_the_page_says_so(playwright: Playwright, served: Callable[..., str], scene: Path, arguments) -> None:
+@pytest.mark.parametrize(
+    "arguments", [["--disable-3d-apis"], ["--disable-gpu", "--disable-webgl", "--disable-webgl2"]]
+)
+def test_without_graphics_the_page_says_so(
+    playwright: Playwright, served: Callable[..., str], scene: Path, arguments
+) -> None:
     browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *arguments])
     page = browser.new_page()
     problems = []

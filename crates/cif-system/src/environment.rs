@@ -77,6 +77,10 @@ variables! {
     TEST_VALIDATOR = "CIF_TEST_VALIDATOR", Tests, "a program or its path", default "the tests are skipped";
     /// Python with NVIDIA's SimReady features, for `tests/python/test_simready.py`.
     TEST_SIMREADY = "CIF_TEST_SIMREADY", Tests, "a program or its path", default "the tests are skipped";
+    /// Browser for `tests/python/test_page.py`.
+    TEST_CHROMIUM = "CIF_TEST_CHROMIUM", Tests, "a program or its path", default "a Chromium on the PATH";
+    /// Tests of the page in a browser: `require` fails without one.
+    TEST_PAGE = "CIF_TEST_PAGE", Tests, "`require`", default "the tests are skipped without a browser";
     /// Time for which `make fuzz` damages files, with random seeds.
     FUZZ_MINUTES = "CIF_FUZZ_MINUTES", Tests, "minutes", default "a fixed number of files with fixed seeds";
     /// Readers that are given damaged files: those whose name contains the text.

@@ -237,3 +237,57 @@ fn a_run_is_watched_and_stopped_from_its_page() {
         .expect("the command starts");
     assert!(resumed.status.success(), "{}", String::from_utf8_lossy(&resumed.stderr));
 }
+
+#[test]
+fn films_are_made_of_views_by_ffmpeg() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    scene(folder.path());
+    let run = |arguments: &[&str]| {
+        let output = Command::new(CIF)
+            .args(arguments)
+            .current_dir(folder.path())
+            .output()
+            .expect("the command starts");
+        (output.status.success(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    let views = r#"[{ "width": 33, "height": 24, "vertical_fov_deg": 45, "position": [0, -3, 1], "look_at": [0, 0, 0],
+        "up": [0, 0, 1] }]"#;
+    std::fs::write(folder.path().join("views.json"), views).expect("the folder can be written");
+    for (what, fps, output, why) in [
+        ("rgb,depth", "24", "a.mp4", "a film shows one layer"),
+        ("rgb", "24", "folder", "--fps is about a film"),
+        ("rgb", "0", "a.mp4", "above 0"),
+    ] {
+        let line =
+            ["render", "scene.cif", "--camera", "views.json", "--what", what, "--fps", fps, "-o", output];
+        let (succeeded, told) = run(&line);
+        assert!(!succeeded && told.contains(why), "{told}");
+        assert!(!folder.path().join(output).exists());
+    }
+    if Command::new("ffmpeg").arg("-version").output().is_err() {
+        eprintln!("skipped: there is no ffmpeg");
+        return;
+    }
+    for film in ["a.mp4", "a.gif", "a.webm"] {
+        let line = ["render", "scene.cif", "--camera", "views.json", "--backend", "cpu", "-o", film];
+        let (succeeded, told) = run(&line);
+        assert!(succeeded, "{told}");
+        let (succeeded, told) = run(&line);
+        assert!(!succeeded && told.contains("--force"), "{told}");
+    }
+    let decoded = folder.path().join("frame.png");
+    let status = Command::new("ffmpeg")
+        .args(["-v", "error", "-i", "a.mp4", "frame.png"])
+        .current_dir(folder.path())
+        .status()
+        .expect("ffmpeg starts");
+    assert!(status.success());
+    let size = image::image_dimensions(decoded).expect("a picture");
+    assert_eq!(size, (32, 24), "players want even sides");
+    let left: Vec<_> = std::fs::read_dir(folder.path())
+        .expect("the folder")
+        .map(|entry| entry.expect("an entry").file_name().into_string().expect("a name"))
+        .filter(|name| name.starts_with('.'))
+        .collect();
+    assert!(left.is_empty(), "{left:?}");
+}

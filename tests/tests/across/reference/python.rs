@@ -6,6 +6,7 @@ use super::escape;
 
 const PACKAGE: &str = include_str!("../../../../crates/cif-python/python/cif/__init__.py");
 const STUB: &str = include_str!("../../../../crates/cif-python/python/cif/_native.pyi");
+const VIEW: &str = include_str!("../../../../crates/cif-python/python/cif/_view.py");
 const USD: &str = include_str!("../../../../crates/cif-python/python/cif/usd.py");
 
 const HEAD: &str = "\
@@ -40,7 +41,7 @@ impl Item {
 /// The page.
 pub(super) fn page() -> String {
     let mut page = HEAD.to_owned();
-    let own = items(PACKAGE);
+    let own: Vec<Item> = [PACKAGE, VIEW].into_iter().flat_map(items).collect();
     let native = items(STUB);
     let names = public_names(PACKAGE);
     write!(page, "\n## Module `cif`\n\n{}\n", prose(&module_doc(PACKAGE))).unwrap();

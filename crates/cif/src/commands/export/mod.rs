@@ -1,4 +1,4 @@
-//! `cif export`: a scene as USD, glTF and PLY.
+//! `cif export`: a scene as USD, glTF, PLY and HTML.
 
 mod check;
 mod preset;
@@ -28,7 +28,7 @@ use check::{Check, FileCheck, Finding};
 use preset::{Preferred, Preset};
 use targets::{FILES, Targets, Writing};
 
-/// Export a scene as USD, glTF or PLY, one prim or node per object
+/// Export a scene as USD, glTF or PLY, one prim or node per object, or as a page
 #[derive(Debug, Args)]
 #[command(
     group = ArgGroup::new("result").required(true).multiple(true)

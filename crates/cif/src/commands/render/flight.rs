@@ -10,7 +10,7 @@ use cif_scene::{CameraTrack, LabelPattern, SceneGraph, SceneOptions, UpAxis};
 use cif_web::describe::up;
 use glam::{DMat3, DVec2, DVec3};
 
-use super::Shot;
+use super::shot::Shot;
 use crate::camera_file::View;
 use crate::error::Error;
 
@@ -234,5 +234,118 @@ fn resized(camera: PinholeCamera, size: Option<Size>) -> PinholeCamera {
         principal_px: (camera.principal_px - middle) * scale
             + DVec2::new(f64::from(width), f64::from(height)) / 2.0,
         ..camera
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use cif_field::RecordedCamera;
+    use cif_render::synthetic::{SyntheticConfig, generate};
+
+    use super::*;
+
+    /// A field seen by cameras that stand around its objects at these angles, degrees, 2 units away and 1 above.
+    fn seen_from(angles: &[f64]) -> Field {
+        let config = SyntheticConfig { gaussians: 60, instances: 2, ..SyntheticConfig::default() };
+        let mut field = generate(&config).field;
+        let (centre, lens) = (middle(&field), generate(&config).camera);
+        let camera = |(index, angle): (usize, &f64)| {
+            let (sine, cosine) = angle.to_radians().sin_cos();
+            let place = centre + DVec3::new(2.0 * cosine, 2.0 * sine, 1.0);
+            let camera = looking(&lens, place, centre, DVec3::Z);
+            RecordedCamera { name: format!("cam{index}"), time_index: 0, trained: true, camera }
+        };
+        field.cameras = angles.iter().enumerate().map(camera).collect();
+        field
+    }
+
+    fn flight(field: &Field, path: &str) -> Vec<PinholeCamera> {
+        let film = film(field, &path.parse().unwrap(), None, "scene.cif");
+        film.unwrap_or_else(|error| panic!("{error}")).shots.iter().map(|shot| shot.view.camera).collect()
+    }
+
+    /// Angles about the objects, degrees.
+    fn angles(field: &Field, cameras: &[PinholeCamera]) -> Vec<f64> {
+        let centre = middle(field);
+        let angle = |camera: &PinholeCamera| {
+            let place = camera.centre() - centre;
+            place.y.atan2(place.x).to_degrees()
+        };
+        cameras.iter().map(angle).collect()
+    }
+
+    #[test]
+    fn orbits_stay_where_cameras_have_been() {
+        let field = seen_from(&[10.0, 40.0, 80.0]);
+        let cameras = flight(&field, "orbit");
+        let angles = angles(&field, &cameras);
+        let range = angles.iter().fold((f64::MAX, f64::MIN), |(low, high), a| (low.min(*a), high.max(*a)));
+        assert!((range.0 - 10.0).abs() < 0.5 && (range.1 - 80.0).abs() < 0.5, "{range:?}");
+        assert!(
+            (angles[0] - angles[angles.len() - 1]).abs() < 1e-6,
+            "a film that is played again does not jump"
+        );
+        for camera in &cameras {
+            let seen = camera.camera_from_world.apply(middle(&field));
+            assert!(seen.x.abs() < 1e-9 && seen.y.abs() < 1e-9 && seen.z > 0.0, "{seen}");
+            let distance = (camera.centre() - middle(&field)).length();
+            assert!((distance - 5.0_f64.sqrt()).abs() < 1e-9, "{distance}");
+        }
+    }
+
+    #[test]
+    fn orbits_go_around_where_cameras_stand_all_around() {
+        let field = seen_from(&[0.0, 80.0, 160.0, 240.0, 320.0]);
+        let angles = angles(&field, &flight(&field, "orbit"));
+        let turned: f64 = angles.windows(2).map(|pair| (pair[1] - pair[0]).rem_euclid(360.0)).sum();
+        assert!((turned - 360.0).abs() < 1e-6, "{turned}");
+    }
+
+    #[test]
+    fn flights_pass_through_the_recorded_cameras() {
+        let field = seen_from(&[0.0, 20.0, 50.0]);
+        let cameras = flight(&field, "cameras");
+        for recorded in &field.cameras {
+            let place = recorded.camera.centre();
+            let nearest = cameras.iter().map(|camera| camera.centre().distance(place));
+            assert!(nearest.fold(f64::MAX, f64::min) < 0.05, "{}", recorded.name);
+        }
+    }
+
+    #[test]
+    fn an_object_that_is_followed_stays_in_the_middle() {
+        let field = seen_from(&[0.0]);
+        let label = field.instances[1].label.clone();
+        let cameras = flight(&field, &format!("follow:{label}"));
+        let graph = cif_scene::build(&field, &SceneOptions::default()).unwrap();
+        let node = graph.nodes.iter().find(|node| node.label == label).unwrap();
+        let codes = &graph.time_codes.samples;
+        assert!(codes.len() < 2 || cameras.len() == codes.len());
+        let place = node.boxes().world(codes[0]).centre();
+        let seen = cameras[0].camera_from_world.apply(place);
+        assert!(seen.x.abs() < 1e-9 && seen.y.abs() < 1e-9 && seen.z > 0.0, "{seen}");
+        let error = film(&field, &Flight::Follow("teapot".into()), None, "scene.cif").err().unwrap();
+        assert!(error.to_string().contains("no object is labelled 'teapot'"), "{error}");
+        let unseen = Field { cameras: Vec::new(), ..field };
+        let error = film(&unseen, &Flight::Orbit, None, "scene.cif").err().unwrap();
+        assert!(error.to_string().contains("records no cameras"), "{error}");
+    }
+
+    #[test]
+    fn sizes_keep_the_vertical_view() {
+        let field = seen_from(&[0.0]);
+        let size = "200x100".parse().unwrap();
+        let film = film(&field, &Flight::Cameras, Some(size), "scene.cif").map_err(|error| error.to_string());
+        let camera = film.unwrap().shots[0].view.camera;
+        let recorded = field.cameras[0].camera;
+        assert_eq!((camera.width, camera.height), (200, 100));
+        let of = |camera: &PinholeCamera| camera.focal_px.y / f64::from(camera.height);
+        assert!((of(&camera) - of(&recorded)).abs() < 1e-12);
+        for wrong in ["200", "0x5", "x", "99999x99999"] {
+            assert!(wrong.parse::<Size>().is_err(), "{wrong}");
+        }
+        for wrong in ["spiral", "follow:", "orbit:1"] {
+            assert!(wrong.parse::<Flight>().is_err(), "{wrong}");
+        }
     }
 }

@@ -5,6 +5,7 @@ mod film;
 mod flight;
 mod layers;
 mod painter;
+mod shot;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -45,6 +46,7 @@ use layers::What;
 use painter::Painter;
 #[cfg(feature = "wgpu")]
 use painter::Sample;
+use shot::Shot;
 
 /// Render a scene from captured or new views
 #[derive(Debug, Args)]
@@ -500,12 +502,6 @@ fn painter(
     _: Option<f64>,
 ) -> Result<Painter, Error> {
     Ok(Painter::cpu(command.simd.into()))
-}
-
-/// A view, and the camera that it belongs to.
-struct Shot {
-    view: View,
-    camera: String,
 }
 
 /// The views, and how many of them are shown per second.
