@@ -211,6 +211,7 @@ def test_tables_for_notebooks(field: cif.Field) -> None:
     table = field._repr_html_()
     for text in ["340 Gaussians", "<td>red mug</td>", "<td>napkin</td>", f"<td>{PER_OBJECT}</td>"]:
         assert text in table, table
+    assert table.startswith('<img src="data:image/png;base64,iVBOR')
     arrays = {name: np.ones((1, 3), np.float32) for name in ["means", "scales", "colors"]}
     hostile = cif.Field.from_arrays(
         **arrays,
@@ -221,7 +222,9 @@ def test_tables_for_notebooks(field: cif.Field) -> None:
     assert "<td>&lt;b&gt;&amp;mug</td>" in hostile._repr_html_()
     dataset = cif.open_dataset(CAPTURE)
     summary = dataset.summary()
-    assert f"<td>frames</td><td>{summary['frames']}</td>" in dataset._repr_html_()
+    shown = dataset._repr_html_()
+    assert f"<td>frames</td><td>{summary['frames']}</td>" in shown
+    assert shown.startswith('<img src="data:image/png;base64,iVBOR')
     image = dataset.load_frame(3)["image"]
     assert np.array_equal(dataset.show(3).pixels, image)
     mask = next(k for k, frame in enumerate(dataset.frames) if frame["mask"])

@@ -18,14 +18,16 @@ __all__ = ["Page", "view"]
 class Page:
     """A page that `view` serves until it is closed, or this process ends."""
 
-    def __init__(self, address: str, process: subprocess.Popen[str], folder: tempfile.TemporaryDirectory[str] | None):
+    def __init__(
+        self, address: str, process: subprocess.Popen[str], folder: tempfile.TemporaryDirectory[str] | None
+    ):
         self.address = address
         self._process = process
         self._folder = folder
         atexit.register(self.close)
 
     def close(self) -> None:
-        """Ends the page."""
+        """End the page."""
         atexit.unregister(self.close)
         self._process.terminate()
         self._process.communicate()
@@ -55,8 +57,8 @@ def view(
 ) -> Page:
     """Show a scene, an exported file or a capture in a browser, as `cif view` does.
 
-    scene is a field, a dataset, or the path of a scene, a stage, a glTF file, a PLY or a capture; capture is compared with
-    the scene. The page is there until it is closed or this process ends.
+    scene is a field, a dataset, or the path of a scene, a stage, a glTF file, a PLY or a capture; capture is
+    compared with the scene. The page is there until it is closed or this process ends.
     """
     folder = None
     if isinstance(scene, Field):

@@ -103,10 +103,6 @@ impl Watch {
         let title = name_of(output);
         let server = Arc::new(Server::start(Shown::of(Page::empty(&title), None), 0)?);
         let address = server.address();
-        note!("the run can be watched at {address}");
-        if opening == Opening::Open && open::that_detached(&address).is_err() {
-            warning!("no browser could be started; open the address above in one");
-        }
         let is_over = Arc::new(AtomicBool::new(false));
         let answers = std::thread::spawn({
             let (server, is_over) = (Arc::clone(&server), Arc::clone(&is_over));
@@ -122,6 +118,10 @@ impl Watch {
             title,
         };
         watch.tell();
+        note!("the run can be watched at {address}");
+        if opening == Opening::Open && open::that_detached(&address).is_err() {
+            warning!("no browser could be started; open the address above in one");
+        }
         Ok(Arc::new(watch))
     }
 
@@ -269,10 +269,10 @@ impl Drop for Watch {
 fn add(curve: &mut Vec<[f64; 2]>, point: [f64; 2]) {
     curve.push(point);
     if curve.len() > MOST_POINTS {
-        let mut index = 0;
+        let mut behind = curve.len();
         curve.retain(|_| {
-            index += 1;
-            index % 2 == 0
+            behind -= 1;
+            behind.is_multiple_of(2)
         });
     }
 }
