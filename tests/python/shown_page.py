@@ -1,4 +1,4 @@
-"""A page of `cif view` in Chromium, as tests use it: what it draws and holds, and what it reported and loaded."""
+"""A page of `cif view` in Chromium: what it draws and holds, and what it reported and loaded."""
 
 from __future__ import annotations
 
@@ -12,16 +12,19 @@ from typing import TYPE_CHECKING, Any
 
 import cif
 import numpy as np
+import pytest
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Locator, Page
+    from playwright.sync_api import Browser, Locator, Page, Playwright
 
 NAMES = [os.environ.get("CIF_TEST_CHROMIUM"), "chromium", "chromium-browser", "google-chrome"]
 CHROMIUM = next(filter(None, (shutil.which(name) for name in NAMES if name)), None)
 LACKING = [name for name in ("playwright", "PIL", "pxr") if importlib.util.find_spec(name) is None]
 LACKING += [] if CHROMIUM else ["Chromium"]
+REASON = f"{', '.join(LACKING)} not found: see tests/README.md"
+NEEDED = pytest.mark.skipif(bool(LACKING) and os.environ.get("CIF_TEST_PAGE") != "require", reason=REASON)
 
-DRAWING = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+DRAWING = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 TWO_FRAMES = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done())))"
 # Splats as the page draws them at a time code: all, in their own colours, where plain is true.
 DRAW = """([shot, code, plain]) => {
@@ -33,6 +36,8 @@ DRAW = """([shot, code, plain]) => {
 }"""
 READ = """(canvas) => [canvas.width, canvas.height,
   canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data]"""
+MARK = """JSON.stringify([cif.state, cif.shot().pose, document.activeElement.id,
+  document.documentElement.dataset.theme, document.getElementById('help-dialog').open])"""
 
 
 def until(is_so: Callable[[], Any]) -> None:
@@ -40,6 +45,10 @@ def until(is_so: Callable[[], Any]) -> None:
     while not is_so():
         assert time.monotonic() < end, "it did not happen"
         time.sleep(0.02)
+
+
+def launch(playwright: Playwright, *arguments: str) -> Browser:
+    return playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *(arguments or DRAWING)])
 
 
 class ShownPage:
@@ -95,6 +104,14 @@ class ShownPage:
         for key in keys:
             self.page.keyboard.press(key)
 
+    def hold(self, *keys: str) -> None:
+        """Holds keys down until a picture was drawn."""
+        for key in keys:
+            self.page.keyboard.down(key)
+        self.settle()
+        for key in reversed(keys):
+            self.page.keyboard.up(key)
+
     def go(self, code: float) -> None:
         """Scrubs to a time code."""
         self.find("#scrub").fill(str(code))
@@ -104,9 +121,18 @@ class ShownPage:
         self.find("#list .item", has_text=label).first.click()
         return self.document()["nodes"][self.state("selected")]
 
+    def settle(self) -> None:
+        """Waits until changes are drawn."""
+        self.get(TWO_FRAMES)
+
+    def mark(self) -> str:
+        """Everything that a key or a button may change."""
+        self.settle()
+        return self.get(MARK)
+
     def shot(self) -> dict[str, Any]:
         """The camera of the picture."""
-        self.get(TWO_FRAMES)
+        self.settle()
         return self.get("cif.shot()")
 
     def draw(self, code: float, shot: dict[str, Any], plain: bool = True) -> np.ndarray:
@@ -116,7 +142,7 @@ class ShownPage:
 
     def canvas(self, selector: str) -> np.ndarray:
         """What a 2D canvas holds, uint8 `[H, W, 4]`."""
-        self.get(TWO_FRAMES)
+        self.settle()
         width, height, values = self.find(selector).evaluate(READ)
         return np.array(values, np.uint8).reshape(height, width, 4)
 
@@ -124,7 +150,7 @@ class ShownPage:
         """The picture on the screen, reduced to a size, `[H, W, 3]` in [0, 1]."""
         from PIL import Image
 
-        self.get(TWO_FRAMES)
+        self.settle()
         picture = Image.open(io.BytesIO(self.find("#picture").screenshot())).convert("RGB")
         return np.asarray(picture.resize(size, Image.Resampling.BOX)) / 255
 

@@ -172,7 +172,12 @@ export class Comparison {
         'maskOpacity',
         'followTime',
       ];
-      if (keys.some((key) => changed.has(key))) this.show();
+      const isEdited = changed.has('scene');
+      if (isEdited) {
+        this.ratios.clear();
+        this.ratiosOfNodes.clear();
+      }
+      if (isEdited || keys.some((key) => changed.has(key))) this.show();
     });
     this.show();
   }

@@ -198,7 +198,8 @@ export class Overlay {
     const [width, height] = shot.size;
     if (this.canvas.width !== width || this.canvas.height !== height)
       Object.assign(this.canvas, { width, height });
-    this.context.clearRect(0, 0, width, height);
+    // Not clearRect, which alone leaves the last picture on the screen in Chromium 156.
+    this.context.reset();
     const lines = new LineCanvas(this.context, shot, engine.near(), ratio);
     if (state.grid) this.drawGrid(lines);
     this.frusta = [];
