@@ -153,7 +153,7 @@ fn outputs_of_another_kind_are_refused_with_the_fix() {
         ("import t.glb -o x.usda", "x.cif"),
         ("check t.cif --fix x.glb", "x.cif"),
         ("embed t.cif --capture table --models m -o x.usda", "x.cif"),
-        ("render t.cif --capture table -o out.mp4", "ffmpeg"),
+        ("render t.cif --capture table --exr -o out.mp4", "-o views"),
         ("render t.cif --capture table -o out.png", "without .png: out"),
         ("eval t.cif table --images look.png", "without .png: look"),
         ("masks import table/masks -o out.json --capture table", "without .json: out"),
