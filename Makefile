@@ -91,7 +91,9 @@ demo: build
 	$(BIN)/cif export $(OUT)/scene.cif --usd $(OUT)/out.usda --check --capture $(DEMO_CAPTURE) --force
 	$(BIN)/cif query $(OUT)/out.usda --label "$(DEMO_LABEL)" --time 36
 	$(BIN)/cif render $(OUT)/scene.cif --capture $(DEMO_CAPTURE) --split val --what rgb,instance-color,depth-color -o $(OUT)/views --force
+	$(BIN)/cif export $(OUT)/scene.cif --html $(OUT)/scene.html --force
 	@echo
+	@echo "$(OUT)/scene.html   the scene to look at: open it in a browser; or: $(BIN)/cif view $(OUT)/scene.cif --capture $(DEMO_CAPTURE)"
 	@echo "$(OUT)/scene.cif    the trained scene"
 	@echo "$(OUT)/out.usda     the stage: one prim per object; try: $(BIN)/cif query $(OUT)/out.usda --label '*'"
 	@echo "$(OUT)/metrics.json how good it is"
