@@ -5,9 +5,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use tiny_http::{Header, Method, Request, Response};
-
 use cif_web::Page;
+use tiny_http::{Header, Method, Request, Response};
 
 use super::images::Images;
 use super::shown::Shown;
