@@ -70,7 +70,7 @@ class ShownPage:
             self.problems.append(f"{message.type}: {message.text}")
 
     def open(self) -> str | None:
-        """Loads the page, and tells its state."""
+        """Loads the page, and returns its state."""
         self.page.goto(self.address)
         return self.page.wait_for_selector("html[data-state]").get_attribute("data-state")
 

@@ -53,7 +53,7 @@ def browser(playwright: Playwright) -> Iterator[Browser]:
 
 @pytest.fixture(scope="session")
 def serve() -> Iterator[Callable[..., str]]:
-    """Serves files and captures until the end, each once; tells the address."""
+    """Serves files and captures until the end, each once; returns the address."""
     pages: dict[tuple, cif.Page] = {}
     with ExitStack() as stack:
 
@@ -444,7 +444,12 @@ def test_edits_come_home(page: ShownPage, stage: Path, trained: cif.Field) -> No
     until(lambda: page.text("#psnr").endswith("dB") and page.text("#psnr") != ratio)
     page.press("compare-render", "reset")
     page.select("cereal box")
-    page.press("frame", "brush")
+    page.press("hide")
+    page.find("#edit-label").fill("a box")
+    page.find("#edit-label").press("Tab")
+    assert page.page.evaluate("cif.state.hidden.filter(Boolean).length") == 2, "hidden for looking, it stays so"
+    page.find("#edit-undo").click()
+    page.press("hide", "frame", "brush")
     area = page.find("#picture").bounding_box()
     page.mouse.move(area["x"] + 0.4 * area["width"], area["y"] + area["height"] / 2)
     page.mouse.down()

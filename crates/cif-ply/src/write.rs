@@ -3,13 +3,13 @@
 //! Per splat 17 + 3 K floats, K = (degree + 1)^2 - 1: x y z, nx ny nz (0), `f_dc_0..2`, `f_rest_*` channel by
 //! channel (all of red first), opacity as logit, logarithms of the scales, `rot_0..3` as (w, x, y, z).
 
-use std::fs::{self, File};
-use std::io::{self, BufWriter, Read, Write};
+use std::fs;
+use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_output::{NewFile, inside};
-use cif_scene::files::{FileError, existing_folder, folder_of, target_of};
+use cif_scene::files::{FileError, begins_with, existing_folder, folder_of, target_of};
 use cif_scene::{Node, SceneGraph, Splats, UpAxis};
 
 use crate::pose::{turn_up, world_splats};
@@ -63,16 +63,10 @@ fn check_file(path: &Path, force: bool) -> Result<(), PlyError> {
     }
     existing_folder(path)?;
     target_of(path, false)?;
-    if path.exists() && !force && !is_ours(path) {
+    if path.exists() && !force && !begins_with(path, MARK_PREFIX) {
         return Err(FileError::Foreign { path: path.to_owned() }.into());
     }
     Ok(())
-}
-
-fn is_ours(path: &Path) -> bool {
-    let mut head = Vec::new();
-    let read = File::open(path).and_then(|file| file.take(MARK_PREFIX.len() as u64).read_to_end(&mut head));
-    read.is_ok() && head == MARK_PREFIX
 }
 
 /// A file to write.

@@ -140,7 +140,7 @@ impl Dataset {
 
     /// The first frame and the counts as a table, for notebooks.
     fn _repr_html_(&self, py: Python<'_>) -> PyResult<String> {
-        // An image that cannot be read is told by what needs it.
+        // An image that cannot be read is an error of what needs it.
         let frame = picture::of_frame(py, self, 0, "rgb");
         let still = frame.ok().map(|frame| frame.as_html(py)).transpose()?.unwrap_or_default();
         Ok(still + &tables::of_summary(&self.__repr__(), &self.summary(py)?)?)

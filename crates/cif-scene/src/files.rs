@@ -1,6 +1,7 @@
 //! File-system checks that all formats share: the place of an output, and errors of reading and writing.
 
-use std::io;
+use std::fs::File;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 pub use cif_output::folder_of;
@@ -74,6 +75,14 @@ pub fn target_of(path: &Path, with_others: bool) -> Result<PathBuf, FileError> {
         return Err(FileError::LinkElsewhere { path: path.to_owned(), target });
     }
     Ok(target)
+}
+
+/// True when a file can be read and begins with these bytes: the mark by which a format knows its own files.
+#[must_use]
+pub fn begins_with(path: &Path, mark: &[u8]) -> bool {
+    let mut head = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(mark.len() as u64).read_to_end(&mut head));
+    read.is_ok() && head == mark
 }
 
 #[cfg(test)]

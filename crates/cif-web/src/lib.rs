@@ -2,7 +2,7 @@
 //!
 //! | module | answers |
 //! |---|---|
-//! | [`document`] | what the page is told of a scene |
+//! | [`document`] | a scene as the page reads it |
 //! | [`describe`](mod@describe) | a scene graph, or the points of a capture, as such a document |
 //! | `arrays` | how its numbers are packed |
 //! | [`assets`] | the page itself, whose files are in `plugin/web`, and what a browser lets it do |

@@ -1,13 +1,12 @@
 //! Pages as files that work from disk.
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{self, Read, Write};
+use std::io::{self, Write};
 use std::path::Path;
 
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
-use cif_scene::files::{FileError, existing_folder, target_of};
+use cif_scene::files::{FileError, begins_with, existing_folder, target_of};
 use cif_scene::{ExportOptions, ExportSummary, SceneGraph};
 use flate2::Compression;
 use flate2::write::GzEncoder;
@@ -26,16 +25,10 @@ const MARK: &str = "<!doctype html>\n<!-- cif ";
 pub fn check_target(path: &Path, options: ExportOptions) -> Result<(), WebError> {
     existing_folder(path)?;
     let target = target_of(path, false)?;
-    if target.exists() && !options.force && !is_ours(&target) {
+    if target.exists() && !options.force && !begins_with(&target, MARK.as_bytes()) {
         return Err(FileError::Foreign { path: path.to_owned() }.into());
     }
     Ok(())
-}
-
-fn is_ours(path: &Path) -> bool {
-    let mut head = Vec::new();
-    let read = File::open(path).and_then(|file| file.take(MARK.len() as u64).read_to_end(&mut head));
-    read.is_ok() && head == MARK.as_bytes()
 }
 
 /// Writes a scene graph as one page that plays it.

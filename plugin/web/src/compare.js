@@ -1,6 +1,6 @@
 // Recorded cameras, and images of the capture beside the render.
 
-import { byId, context2d, nearestIndex } from './page.js';
+import { byId, context2d, LOW_PASS, nearestIndex } from './page.js';
 import { isCapture, resizeCamera } from './view_camera.js';
 
 /** @typedef {import('./types.js').View} View */
@@ -342,7 +342,7 @@ export class Comparison {
     const ratios = (known && view && this.ratiosOfNodes.get(view)) || NO_RATIOS;
     if (ratios !== this.app.ratios) {
       this.app.ratios = ratios;
-      this.app.tell('ratios');
+      this.app.notify('ratios');
     }
     const ready = view && view === this.drawn && !known && !this.app.state.playing;
     if (ready && !isCapture(this.app.scene))
@@ -363,7 +363,7 @@ export class Comparison {
     if (photo) {
       engine.setTime(view.code);
       const shot = resizeCamera(view, photo.width, photo.height);
-      const render = engine.pixels(shot, 0.3 * (photo.height / view.size[1]) ** 2, true);
+      const render = engine.pixels(shot, LOW_PASS * (photo.height / view.size[1]) ** 2, true);
       this.ratios.set(view, `${psnrOf(render, photo.data).toFixed(2)} dB`);
       const mask = view.mask && this.read(this.mask);
       if (mask && mask.width === photo.width && mask.height === photo.height) {

@@ -143,6 +143,8 @@ export class Edits {
   set(node, edit) {
     const { app } = this;
     const { label, poses } = this.original[node];
+    const before = this.of(node);
+    const wasHidden = before.hidden || before.removed;
     const moved = edit.move.some((distance) => distance !== 0);
     const isChanged = moved || edit.hidden || edit.removed || edit.label !== label || edit.erased.size > 0;
     if (isChanged) this.edits.set(node, edit);
@@ -152,9 +154,12 @@ export class Edits {
     shown.track.poses = poses.map((pose) => pose.map((value, k) => (k < 3 ? value + edit.move[k] : value)));
     app.engine.refresh();
     app.engine.erase(node, edit.erased);
+    // What is hidden for looking alone stays so.
     const isHidden = edit.hidden || edit.removed;
-    app.set({ hidden: app.state.hidden.map((hidden, i) => (i === node ? isHidden : hidden)) });
-    app.tell('scene');
+    if (isHidden !== wasHidden) {
+      app.set({ hidden: app.state.hidden.map((hidden, i) => (i === node ? isHidden : hidden)) });
+    }
+    app.notify('scene');
     this.show();
   }
 
@@ -213,7 +218,9 @@ export function layerOf(stage, nodes) {
     fill(over, edited);
   }
   const first = [...root.children.keys()][0] ?? 'World';
-  const facts = [`    defaultPrim = ${quoted(first)}`, `    subLayers = [@./${stage}@]`];
+  // Three of them hold a name with an @ inside.
+  const at = stage.includes('@') ? '@@@' : '@';
+  const facts = [`    defaultPrim = ${quoted(first)}`, `    subLayers = [${at}./${stage}${at}]`];
   const prims = [...root.children].flatMap(([name, over]) => overLines(name, over, ''));
   return ['#usda 1.0', '(', ...facts, ')', '', ...prims, ''].join('\n');
 }

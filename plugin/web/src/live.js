@@ -7,7 +7,7 @@ import { formatCount } from './objects.js';
 /** @typedef {import('./page.js').SceneDocument} SceneDocument */
 
 /**
- * What the server tells of a run.
+ * Status of a run, as the server has it.
  * @typedef {object} RunStatus
  * @property {number} revision Counts the states of the scene.
  * @property {'running' | 'stopping' | 'saved' | 'failed'} state
@@ -141,7 +141,7 @@ function isOver(status) {
 }
 
 /**
- * Objects and cameras of a scene, by which two of them are told apart.
+ * Objects and cameras of a scene, by which two of them are distinguished.
  * @param {SceneDocument} scene
  * @returns {string}
  */

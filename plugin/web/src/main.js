@@ -1,7 +1,7 @@
 // Puts the page together.
 
 import { Engine } from './engine.js';
-import { byId, loadScene, make, PageError, showFailure } from './page.js';
+import { byId, loadScene, LOW_PASS, make, PageError, showFailure } from './page.js';
 import { cameraAt, freeFocal, isCapture, resetCamera, resizeCamera, ViewCamera } from './view_camera.js';
 import { cameraCommands, CameraControls } from './view_camera.js';
 import { Player, playerCommands } from './player.js';
@@ -21,7 +21,6 @@ import { LiveRun } from './live.js';
 
 const LARGEST_RATIO = 2;
 const TINT = 0.55;
-const LOW_PASS = 0.3;
 const LONGEST_STEP = 0.1;
 const NOTE_TIME = 2500;
 const STATISTICS_INTERVAL = 250;
@@ -149,10 +148,10 @@ class ScenePage {
   }
 
   /**
-   * Tells the listeners of a change that the state does not hold.
+   * Calls the listeners for a change that the state does not hold.
    * @param {string} key
    */
-  tell(key) {
+  notify(key) {
     for (const listener of this.listeners) listener(new Set([key]));
   }
 
@@ -165,7 +164,7 @@ class ScenePage {
     this.scene = scene;
     this.engine.replace(scene, bytes);
     this.applyLook();
-    this.tell('scene');
+    this.notify('scene');
   }
 
   /** @param {(changed: Set<string>) => void} listener */

@@ -54,9 +54,9 @@
  * @property {Engine} engine
  * @property {State} state
  * @property {ViewCamera} viewCamera
- * @property {(patch: Partial<State>) => void} set Changes the state and tells the listeners.
+ * @property {(patch: Partial<State>) => void} set Changes the state and calls the listeners.
  * @property {(listener: (changed: Set<string>) => void) => void} listen
- * @property {(key: string) => void} tell Tells of a change that the state does not hold, such as `scene`.
+ * @property {(key: string) => void} notify Calls listeners for a change outside the state: `scene`.
  * @property {(scene: SceneDocument, bytes: ArrayBuffer) => void} replace Other splats of the same objects.
  * @property {(number | null)[]} ratios PSNR of each node in the compared image, decibels; empty without one.
  * @property {() => void} redraw Draws in the next frame.
@@ -68,6 +68,9 @@
  * @property {(x: number, y: number, isUndone: boolean) => void} brushAt Erases or brings back at CSS pixels.
  * @property {(text: string) => void} say Shows a short message.
  */
+
+/** Dilation of splats at the resolution of a capture, px^2. */
+export const LOW_PASS = 0.3;
 
 /** Radius of the brush, CSS pixels. */
 export const BRUSH_RADIUS = 18;

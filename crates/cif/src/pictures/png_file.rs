@@ -35,7 +35,7 @@ pub fn png_bytes(picture: &Picture) -> Result<Vec<u8>, Error> {
 ///
 /// # Errors
 /// When the picture is empty.
-pub fn png_bytes_clear(picture: &PixelGrid<[u8; 4]>) -> Result<Vec<u8>, Error> {
+pub fn png_bytes_rgba(picture: &PixelGrid<[u8; 4]>) -> Result<Vec<u8>, Error> {
     encoded(ColorType::Rgba, picture.width, picture.height, picture.pixels.as_flattened())
 }
 

@@ -219,13 +219,13 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
         outputs.file(&command.output)?;
     } else {
         output::check_folder(folder, command.force)?;
-    }
-    for Shot { view, .. } in views.iter().filter(|_| !is_film) {
-        for what in &what {
-            outputs.picture(&command.output.join(what.folder()), &view.name, "png")?;
-        }
-        if command.exr {
-            outputs.picture(&command.output.join(EXR_FOLDER), &view.name, "exr")?;
+        for Shot { view, .. } in &views {
+            for what in &what {
+                outputs.picture(&folder.join(what.folder()), &view.name, "png")?;
+            }
+            if command.exr {
+                outputs.picture(&folder.join(EXR_FOLDER), &view.name, "exr")?;
+            }
         }
     }
     let depth = command.exr || what.contains(&What::Depth) || what.contains(&What::DepthColor);
@@ -290,8 +290,13 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     film.map_or(Ok(()), FilmFile::finish)?;
     let seconds = (clock.now() - start).wall_s;
     outcome!("rendered {} views into {}", views.len(), command.output.display());
-    let layers: Vec<String> =
-        what.iter().map(|what| what.folder()).chain(command.exr.then(|| EXR_FOLDER.to_owned())).collect();
+    // A film is one file of all views.
+    let layers: Vec<String> = match is_film {
+        true => Vec::new(),
+        false => {
+            what.iter().map(|what| what.folder()).chain(command.exr.then(|| EXR_FOLDER.to_owned())).collect()
+        }
+    };
     let report = report(&layers, &views, time_of_all, command, seconds)?;
     command.report.give(|| report, || {})
 }
@@ -404,10 +409,7 @@ fn report<'a>(
             time: time_of_all.or(view.time).unwrap_or(0.0),
             width: view.camera.width,
             height: view.camera.height,
-            files: match endings::is_film(&command.output) {
-                true => BTreeMap::new(),
-                false => layers.iter().map(file).collect::<Result<_, Error>>()?,
-            },
+            files: layers.iter().map(file).collect::<Result<_, Error>>()?,
         })
     };
     let views = views.iter().map(view).collect::<Result<Vec<_>, Error>>()?;

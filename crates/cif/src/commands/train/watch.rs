@@ -117,7 +117,7 @@ impl Watch {
             state: Mutex::new(State { start: now, next: now, status }),
             title,
         };
-        watch.tell();
+        watch.publish();
         note!("the run can be watched at {address}");
         if opening == Opening::Open && open::that_detached(&address).is_err() {
             warning!("no browser could be started; open the address above in one");
@@ -149,7 +149,7 @@ impl Watch {
             _ => return,
         }
         drop(state);
-        self.tell();
+        self.publish();
     }
 
     /// Takes an event of the run.
@@ -193,7 +193,7 @@ impl Watch {
             _ => return,
         }
         drop(state);
-        self.tell();
+        self.publish();
     }
 
     /// Shows the field, where that is due and somebody looks.
@@ -222,7 +222,7 @@ impl Watch {
         state.next = Instant::now() + PAUSE.max(SHARE * spent);
     }
 
-    /// Tells the last state, and closes the page.
+    /// Shows the last state, and closes the page.
     pub(super) fn end(&self, succeeded: bool, trainer: &Trainer) {
         let mut state = self.state();
         let status = &mut state.status;
@@ -233,21 +233,22 @@ impl Watch {
         state.next = Instant::now();
         self.show(&mut state, trainer.field());
         drop(state);
-        self.tell();
+        self.publish();
         if self.server.is_watched() {
             std::thread::sleep(FAREWELL);
         }
         note!("{showing_s:.1} s went into what the page showed while the run went on");
     }
 
-    fn tell(&self) {
+    /// Gives the page the present status.
+    fn publish(&self) {
         let mut state = self.state();
         state.status.seconds = state.start.elapsed().as_secs_f64();
         if state.status.state == "running" && self.server.is_stopped() {
             state.status.state = "stopping";
         }
         if let Ok(status) = serde_json::to_vec(&state.status) {
-            self.server.tell(status);
+            self.server.set_status(status);
         }
     }
 

@@ -3,7 +3,7 @@
 use cif_dataset::Dataset;
 
 use crate::error::Error;
-use crate::pictures::{instance_color, png_bytes, png_bytes_clear};
+use crate::pictures::{instance_color, png_bytes, png_bytes_rgba};
 
 /// Opacity of a mask over its image.
 const MASK: u8 = 150;
@@ -35,7 +35,7 @@ impl Images {
     fn mask(&self, index: usize) -> Result<Vec<u8>, Error> {
         let mask = self.0.load_mask(index).map_err(Error::plain)?;
         let mask = mask.ok_or_else(|| Error::plain("the frame has no mask"))?;
-        png_bytes_clear(&mask.map(|id| match *id {
+        png_bytes_rgba(&mask.map(|id| match *id {
             0 => [0; 4],
             id => {
                 let [red, green, blue] = instance_color(id);

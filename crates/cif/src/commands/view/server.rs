@@ -31,7 +31,7 @@ pub(in crate::commands) struct Server {
     content: Content,
 }
 
-/// All that the server tells.
+/// All that the server answers with.
 struct Content {
     page: cif_web::assets::Html,
     scene: Mutex<Scene>,
@@ -98,8 +98,8 @@ impl Server {
         Ok(())
     }
 
-    /// Tells how far the run is that the page watches, JSON.
-    pub(in crate::commands) fn tell(&self, status: Vec<u8>) {
+    /// Sets how far the run is that the page watches, JSON.
+    pub(in crate::commands) fn set_status(&self, status: Vec<u8>) {
         self.content.scene().status = Some(status);
     }
 
