@@ -2,7 +2,9 @@
 
 use std::ffi::OsStr;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::{Child, Command, Output, Stdio};
+use std::thread::sleep;
+use std::time::Duration;
 
 /// What a run of the command left behind.
 #[derive(Debug)]
@@ -69,6 +71,56 @@ pub const SMALL_MODEL: &str = "--set model.spatial_resolution=[8,8,8] --set mode
 #[must_use]
 pub fn run_line(program: &str, folder: &Path, line: &str) -> Run {
     run(program, folder, line.split_whitespace())
+}
+
+/// A command in the background, killed in the end.
+#[derive(Debug)]
+pub struct Background(Child);
+
+impl Background {
+    /// Starts `program` in `folder` with the words of a line.
+    ///
+    /// # Panics
+    /// When it cannot be started.
+    #[must_use]
+    pub fn start(program: &str, folder: &Path, line: &str) -> Self {
+        let mut command = Command::new(program);
+        command.args(line.split_whitespace()).current_dir(folder).stdout(Stdio::null()).stderr(Stdio::null());
+        Self(command.spawn().expect("the command starts"))
+    }
+
+    /// Waits until `what` holds, while the command runs.
+    ///
+    /// # Panics
+    /// When the command ends before.
+    pub fn until(&mut self, what: impl Fn() -> bool) {
+        while !what() {
+            let ended = self.0.try_wait().expect("the process can be asked");
+            assert!(ended.is_none(), "it ended too early");
+            sleep(Duration::from_millis(10));
+        }
+    }
+
+    /// Its process.
+    #[must_use]
+    pub fn id(&self) -> u32 {
+        self.0.id()
+    }
+
+    /// Waits for its end; the exit code, `None` when killed.
+    ///
+    /// # Panics
+    /// When it cannot be waited for.
+    pub fn ends(&mut self) -> Option<i32> {
+        self.0.wait().expect("the process can be waited for").code()
+    }
+}
+
+impl Drop for Background {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
 }
 
 /// JSON that the command wrote.

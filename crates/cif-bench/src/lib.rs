@@ -3,6 +3,7 @@
 //! | module | answers |
 //! |---|---|
 //! | [`accuracy`] | what accuracy costs, as a report |
+//! | [`batch`] | all scenes of a batch, as a page and tables |
 //! | [`comparison`] | the method compared with other systems and without its parts, as tables and a page |
 //! | [`export`] | what accuracy of exported motion costs in bytes and seconds |
 //! | [`hard_captures`] | variants of captures whose changes must not matter or must not break a run |
@@ -11,6 +12,7 @@
 //! | `device` | stages of a step on a GPU compared with their least possible time, behind the feature `wgpu` |
 
 pub mod accuracy;
+pub mod batch;
 pub mod comparison;
 #[cfg(feature = "wgpu")]
 pub mod device;

@@ -16,29 +16,32 @@ pub(crate) struct Header<'a> {
     pub(crate) title: &'a str,
     pub(crate) heading: &'a str,
     pub(crate) description: &'a str,
-    pub(crate) threads: usize,
-    /// Vector instructions.
-    pub(crate) simd: &'a str,
+    /// What it was measured with; see [`measured_on`].
+    pub(crate) how: String,
     pub(crate) command: &'a str,
     /// The missing part and how to get it; `None` on a whole page.
     pub(crate) missing: Option<String>,
 }
 
+/// What numbers of one process were measured with.
+pub(crate) fn measured_on(threads: usize, simd: &str) -> String {
+    match threads {
+        1 => format!("Measured on one thread with {simd}."),
+        threads => format!("Measured on {threads} threads with {simd}."),
+    }
+}
+
 /// Begins a page, up to where its header may go on with links; [`close`] ends it.
 pub(crate) fn open(header: &Header<'_>) -> String {
-    let threads = match header.threads {
-        1 => "one thread".to_owned(),
-        threads => format!("{threads} threads"),
-    };
     let mut page = format!(
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<meta name=\"viewport\" \
          content=\"width=device-width, initial-scale=1\">\n<title>{}</title>\n<style>\n{STYLE}</style>\n\
-         </head>\n<body>\n<header>\n<h1>{}</h1>\n<p>{}</p>\n<p class=\"how\">Measured on {threads} with {}. Made \
+         </head>\n<body>\n<header>\n<h1>{}</h1>\n<p>{}</p>\n<p class=\"how\">{} Made \
          by <code>{}</code>.</p>\n",
         escape(header.title),
         escape(header.heading),
         escape(header.description),
-        escape(header.simd),
+        escape(&header.how),
         escape(header.command),
     );
     if let Some(missing) = &header.missing {

@@ -132,6 +132,13 @@ impl MadeFrom {
         Self { inputs, values: self.values.clone() }
     }
 
+    /// Hexadecimal digits that are the same for the same content and values.
+    #[must_use]
+    pub fn digest(&self) -> String {
+        let text = serde_json::to_vec(&self.by_content()).unwrap_or_default();
+        format!("{:032x}", xxh3_128(&text))
+    }
+
     /// The inputs whose names are `wanted`, and no values.
     pub(crate) fn only(&self, wanted: impl Fn(&str) -> bool) -> Self {
         let inputs = self.inputs.iter().filter(|(name, _)| wanted(name));
@@ -272,6 +279,8 @@ mod tests {
         let before: MadeFrom = serde_json::from_str(&text).unwrap();
         assert_eq!(before, now(0, Some(&before)));
         assert_eq!(before.by_content(), now(0, None));
+        assert_eq!(before.digest(), now(0, None).digest());
+        assert_ne!(before.digest(), now(1, None).digest());
         std::fs::rename(folder.path().join("2.png"), folder.path().join("3.png")).unwrap();
         let told = before.difference(&now(0, None)).unwrap();
         assert_eq!(told, "keyframe 2.png is gone, and keyframe 3.png is new");

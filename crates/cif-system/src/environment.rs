@@ -60,6 +60,10 @@ variables! {
     /// Folders in which a Python that cif starts searches for packages. Relative folders are left out, so that a file
     /// in the current folder cannot stand in for a package.
     PYTHON_PATH = "PYTHONPATH", Users, "folders, separated as in `PATH`", default "none";
+    /// Name of this machine in locks and records of jobs, on systems other than Linux and Windows.
+    HOSTNAME = "HOSTNAME", Users, "a name", default "none";
+    /// Name of this machine in locks and records of jobs, on Windows.
+    COMPUTERNAME = "COMPUTERNAME", Users, "a name", default "that of the system";
     /// Folders in which USD searches for plugins. The Python module appends the folder of its schemas.
     USD_PLUGINS = "PXR_PLUGINPATH_NAME", Users, "folders, separated as in `PATH`", default "none";
 
@@ -77,10 +81,16 @@ variables! {
     TEST_VALIDATOR = "CIF_TEST_VALIDATOR", Tests, "a program or its path", default "the tests are skipped";
     /// Python with NVIDIA's SimReady features, for `tests/python/test_simready.py`.
     TEST_SIMREADY = "CIF_TEST_SIMREADY", Tests, "a program or its path", default "the tests are skipped";
+    /// Program `openjd`, for `tests/python/test_batch.py`.
+    TEST_OPENJD = "CIF_TEST_OPENJD", Tests, "a program or its path", default "the test is skipped";
     /// Browser for `tests/python/test_page.py`.
     TEST_CHROMIUM = "CIF_TEST_CHROMIUM", Tests, "a program or its path", default "a Chromium on the PATH";
     /// Tests of the page in a browser: `require` fails without one.
     TEST_PAGE = "CIF_TEST_PAGE", Tests, "`require`", default "the tests are skipped without a browser";
+    /// Folder of what `make dist` made, for `tests/python/test_dist.py`.
+    TEST_DIST = "CIF_TEST_DIST", Tests, "a folder", default "the tests are skipped";
+    /// Tests of what `make dist` made in containers: `require` fails without a program that builds them.
+    TEST_CONTAINER = "CIF_TEST_CONTAINER", Tests, "`require`", default "the tests are skipped without such a program";
     /// Time for which `make fuzz` damages files, with random seeds.
     FUZZ_MINUTES = "CIF_FUZZ_MINUTES", Tests, "minutes", default "a fixed number of files with fixed seeds";
     /// Readers that are given damaged files: those whose name contains the text.

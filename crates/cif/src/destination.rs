@@ -188,7 +188,7 @@ fn text_of(config: &TrainConfig) -> String {
 }
 
 /// True where a file is a scene that a run can go on with.
-fn is_unfinished(path: &Path) -> bool {
+pub(crate) fn is_unfinished(path: &Path) -> bool {
     Checkpoint::load(path).is_ok_and(|checkpoint| checkpoint.training.is_some())
 }
 

@@ -31,6 +31,15 @@ pub struct Lock {
     _file: File,
 }
 
+/// Outcome of one try.
+#[derive(Debug)]
+pub enum Attempt {
+    /// It is locked for this process; `None`, with a note, where the file system has no locks.
+    Taken(Option<Lock>),
+    /// Another process holds it.
+    Held,
+}
+
 /// Ways in which a lock is not had.
 enum Busy {
     /// Another process has it.
@@ -45,6 +54,18 @@ impl Lock {
     /// When another process holds it, which is named, or the lock file cannot be made.
     pub fn take(target: &Path) -> Result<Option<Self>, Error> {
         Self::attempt(target).map_err(|(Busy::Held(error) | Busy::Failed(error))| error)
+    }
+
+    /// As [`Self::take`], where that another process holds it is no error.
+    ///
+    /// # Errors
+    /// When the lock file cannot be made.
+    pub fn attempt_once(target: &Path) -> Result<Attempt, Error> {
+        match Self::attempt(target) {
+            Ok(lock) => Ok(Attempt::Taken(lock)),
+            Err(Busy::Held(_)) => Ok(Attempt::Held),
+            Err(Busy::Failed(error)) => Err(error),
+        }
     }
 
     /// As [`Self::take`], waiting for other commands to end: for a file that is read, changed and written again, from before
@@ -85,7 +106,10 @@ impl Lock {
                     return Ok(None);
                 }
             }
-            let holder = format!("process {}, since {}\n", std::process::id(), written(SystemTime::now()));
+            let host = cif_system::host::host();
+            let host = if host.is_empty() { host } else { format!(" on {host}") };
+            let holder =
+                format!("process {}{host}, since {}\n", std::process::id(), written(SystemTime::now()));
             file.set_len(0)
                 .and_then(|()| file.rewind())
                 .and_then(|()| file.write_all(holder.as_bytes()))
@@ -147,7 +171,10 @@ mod tests {
         let target = folder.path().join("a.cif");
         let lock = Lock::take(&target).unwrap().unwrap();
         let refused = Lock::take(&target).unwrap_err().to_string();
-        assert!(refused.contains(&format!("(process {}, since ", std::process::id())), "{refused}");
+        assert!(
+            refused.contains(&format!("(process {} on ", std::process::id())) && refused.contains(", since "),
+            "{refused}"
+        );
         assert!(Lock::take(&folder.path().join("b.cif")).unwrap().is_some());
         drop(lock);
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);

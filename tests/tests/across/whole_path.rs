@@ -2,15 +2,13 @@
 
 use std::fs;
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
-use std::thread::sleep;
-use std::time::Duration;
+use std::process::Command;
 
 use cif_dataset::CaptureFrame;
 use cif_field::tracks::{DenseTrack, RotationEvidence, TrackGroup, TrackPose, Tracks, VisibilityStep};
 use cif_field::{Checkpoint, Field, Gaussians, Identities, Instance, SortMetric, Timeline};
 use cif_test::capture::{self, ROLLING, STANDING};
-use cif_test::command::{Run, run};
+use cif_test::command::{Background, Run, run};
 use glam::DQuat;
 use serde_json::Value;
 
@@ -322,44 +320,15 @@ fn an_interrupted_run_resumes_to_the_same_scene() {
 const ENDLESS: &str =
     "--iterations-coarse 10000000 --set model.spatial_resolution=[8,8,8] --set motion.rigid=false --quiet";
 
-/// A command in the background, killed in the end.
-struct Background(Child);
-
-impl Background {
-    fn start(folder: &Path, line: &str) -> Self {
-        let mut command = Command::new(CIF);
-        command.args(line.split_whitespace()).current_dir(folder).stderr(Stdio::null());
-        Self(command.spawn().expect("the command starts"))
-    }
-
-    /// Waits until `what` holds, while the command runs.
-    fn until(&mut self, what: impl Fn() -> bool) {
-        while !what() {
-            assert!(
-                self.0.try_wait().expect("the clock and the process can be asked").is_none(),
-                "it ended too early"
-            );
-            sleep(Duration::from_millis(10));
-        }
-    }
-}
-
-impl Drop for Background {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
 #[test]
 fn one_run_at_a_time_trains_a_scene_and_a_killed_one_is_no_obstacle() {
     let folder = with_capture(4);
     let path = folder.path();
     let line = format!("train table -o a.cif {ENDLESS}");
-    let mut first = Background::start(path, &line);
+    let mut first = Background::start(CIF, path, &line);
     let lock = path.join(".a.cif.lock");
     first.until(|| fs::read_to_string(&lock).is_ok_and(|text| text.contains("since")));
-    let process = format!("process {}", first.0.id());
+    let process = format!("process {}", first.id());
     cif(path, &format!("{line} --force")).fails(1, &["another command", &process, "a.cif"]);
     // Killed before it has saved: the same command begins anew.
     drop(first);
@@ -378,21 +347,22 @@ fn killed_runs_go_on_from_what_was_saved_and_signals_save_first() {
     let scene = path.join("a.cif");
     let steps =
         || Checkpoint::load(&scene).unwrap().training.unwrap().json["progress"]["total_steps"].clone();
-    let mut run = Background::start(path, &format!("train table -o a.cif {ENDLESS} --checkpoint-seconds 1"));
+    let mut run =
+        Background::start(CIF, path, &format!("train table -o a.cif {ENDLESS} --checkpoint-seconds 1"));
     run.until(|| scene.exists());
     drop(run);
     let killed_at = steps();
     assert!(killed_at.as_u64() > Some(0), "{killed_at}");
     // It goes on, says at which step it stands, and saves when it is told to end.
-    let mut run = Background::start(path, "train table -o a.cif --resume --quiet --log run.jsonl");
+    let mut run = Background::start(CIF, path, "train table -o a.cif --resume --quiet --log run.jsonl");
     let log = path.join("run.jsonl");
     run.until(|| fs::read_to_string(&log).is_ok_and(|text| text.contains("\"step\"")));
     let lines = fs::read_to_string(&log).unwrap();
     let begins = lines.lines().find(|line| line.contains("stage_started")).map(json);
     assert_eq!(begins.unwrap()["iteration"], killed_at);
-    let signal = format!("kill -TERM {}", run.0.id());
+    let signal = format!("kill -TERM {}", run.id());
     assert!(Command::new("sh").args(["-c", &signal]).status().unwrap().success());
-    assert_eq!(run.0.wait().unwrap().code(), Some(130));
+    assert_eq!(run.ends(), Some(130));
     assert!(steps().as_u64() > killed_at.as_u64(), "{} after {killed_at}", steps());
 }
 

@@ -384,8 +384,7 @@ fn page(
         title: &title,
         heading: &title,
         description: &subject.description,
-        threads: subject.threads,
-        simd: &subject.simd,
+        how: page::measured_on(subject.threads, &subject.simd),
         command: &subject.command,
         missing: (subject.missing > 0).then(|| {
             format!("{} rungs are not measured yet; run the same command again for them.", subject.missing)

@@ -122,8 +122,7 @@ fn page(
         title: "Comparison",
         heading: "The method compared with others, on one reconstruction",
         description: &comparison.description,
-        threads: comparison.threads,
-        simd: &comparison.simd,
+        how: page::measured_on(comparison.threads, &comparison.simd),
         command: &comparison.command,
         missing: (!comparison.missing.is_empty()).then(|| {
             format!("{} runs are missing; run the same command again for them.", comparison.missing.len())

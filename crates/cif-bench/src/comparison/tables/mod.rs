@@ -39,7 +39,8 @@ impl Mean {
         Self { mean: Some(mean), spread }
     }
 
-    pub(super) fn text(self, digits: usize) -> String {
+    /// The mean, with the deviation behind `±` where there is one.
+    pub(crate) fn text(self, digits: usize) -> String {
         match (self.mean, self.spread) {
             (None, _) => "–".to_owned(),
             (Some(mean), None) => format!("{mean:.digits$}"),

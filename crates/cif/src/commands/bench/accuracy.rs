@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
+use cif_batch::Part;
 use cif_bench::accuracy::ladders::{BASE, Base, NAMES, PAPER, Paper, QUICK_BASE};
 use cif_bench::accuracy::measure::{self, Training};
 use cif_bench::accuracy::record::Record;
@@ -91,6 +92,9 @@ pub(super) struct BenchAccuracy {
     /// Any setting of the base by its key in SCENE.train.toml, e.g. --set seed=3
     #[arg(long, value_name = "TABLE.KEY=VALUE")]
     set: Vec<String>,
+    /// Measure this rung alone and write no report; for jobs of `cif batch`
+    #[arg(long, value_name = "RUNG", conflicts_with = "quick")]
+    only: Option<String>,
     /// Write into a folder that holds other files already
     #[arg(long)]
     force: bool,
@@ -128,8 +132,16 @@ impl BenchAccuracy {
     }
 }
 
-pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
-    command.report.check(&mut crate::output::Outputs::new(command.force))?;
+/// A capture with the ladders that it is measured on.
+struct Prepared {
+    options: CaptureOptions,
+    dataset: Dataset,
+    config: TrainConfig,
+    ladders: Vec<Ladder>,
+}
+
+/// Opens the capture and lays the ladders.
+fn prepare(command: &BenchAccuracy) -> Result<Prepared, Error> {
     let paper = command.paper()?;
     let check = |layout| {
         if let Some(Paper { share, settings }) = &paper {
@@ -139,8 +151,6 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
     };
     let layout = command.capture_options.layout_after(&command.capture, check)?;
     let wanted = base_config(command, layout)?.downscale;
-    let goes_on = command.output.join("rungs").is_dir();
-    output::check_folder(&command.output, command.force || goes_on)?;
     let mut options = command.capture_options.clone();
     options.downscale = options.downscale.or(wanted);
     let mut dataset = options.open(&command.capture)?;
@@ -151,10 +161,6 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
         options.downscale = Some(factor);
         dataset = options.open(&command.capture)?;
     }
-    if base_config(command, layout)?.model.triangulate {
-        starting_points::find(&mut dataset, &Stop::when(interrupt::requested).into())?;
-    }
-    print_warnings(&dataset);
     if !dataset.frames.iter().any(|frame| frame.split == Split::Val) {
         return Err(Error::failed(
             format!("{}: no frame is held out, so nothing can be scored", command.capture.display()),
@@ -172,9 +178,53 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
             "it has a single time or no masks; leave --ladders away for those that fit",
         ));
     }
-    // Two at once would replace each other's records.
-    let _lock = Lock::take(&command.output.join("report.json"))?;
+    Ok(Prepared { options, dataset, config, ladders: all })
+}
+
+/// Rungs as jobs of their own: the base first, which those that train nothing use.
+///
+/// # Errors
+/// When the capture cannot be read, or has nothing to be measured.
+pub(in crate::commands) fn parts(command: &BenchAccuracy) -> Result<Vec<Part>, Error> {
+    if command.quick {
+        return Err(Error::usage(
+            "--quick measures what fits into five minutes, so that its rungs are no jobs",
+            "leave --quick out of the plan",
+        ));
+    }
+    let mut parts = vec![Part { name: BASE.to_owned(), needs: Vec::new() }];
+    for rung in prepare(command)?.ladders.into_iter().flat_map(|ladder| ladder.rungs) {
+        let trains = matches!(rung.work, Work::Train(_) | Work::Preset { .. });
+        if parts.iter().all(|part| part.name != rung.id) {
+            parts.push(Part { name: rung.id, needs: if trains { Vec::new() } else { vec![0] } });
+        }
+    }
+    Ok(parts)
+}
+
+impl BenchAccuracy {
+    /// The same with its capture in a folder, where its path is relative.
+    pub(in crate::commands) fn within(mut self, folder: &Path) -> Self {
+        self.capture = folder.join(self.capture);
+        self
+    }
+}
+
+pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
+    command.report.check(&mut crate::output::Outputs::new(command.force))?;
+    let goes_on = command.output.join("rungs").is_dir();
+    output::check_folder(&command.output, command.force || goes_on)?;
+    let Prepared { options, mut dataset, config, ladders: all } = prepare(command)?;
+    if config.model.triangulate {
+        starting_points::find(&mut dataset, &Stop::when(interrupt::requested).into())?;
+    }
+    print_warnings(&dataset);
     let rungs = Records::inside(&command.output)?;
+    // Two at once would replace each other's records.
+    let _lock = Lock::take(&match &command.only {
+        Some(only) => rungs.file(&format!("{only}.json")),
+        None => command.output.join("report.json"),
+    })?;
     measure::save_truth(&dataset, config.background, &rungs.file("truth.png"))?;
     let mut inputs = MadeFrom::new();
     inputs.value("version", env!("CARGO_PKG_VERSION")).capture(&dataset, rungs.known(BASE).as_ref());
@@ -189,6 +239,14 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
         is_terminal: std::io::stderr().is_terminal(),
     };
     interrupt::watch();
+    if let Some(only) = &command.only {
+        return bench.part(&all, only);
+    }
+    report_all(command, bench, all)
+}
+
+/// Measures all rungs that are not kept, and writes the report.
+fn report_all(command: &BenchAccuracy, mut bench: Bench, all: Vec<Ladder>) -> Result<(), Error> {
     let Rungs { records, left_out, stopped } = bench.measure_all(&all, command.quick)?;
     let measured: Measured = all
         .into_iter()
@@ -491,6 +549,23 @@ impl Bench {
             (self.base, self.exact) = (Some(field), None);
         }
         Ok(Some(record))
+    }
+
+    /// Measures a rung alone, beside others that other processes measure.
+    fn part(&mut self, all: &[Ladder], only: &str) -> Result<(), Error> {
+        let base = Rung { id: BASE.to_owned(), label: "the base".to_owned(), work: Work::Train(Vec::new()) };
+        let mut rungs = all.iter().flat_map(|ladder| &ladder.rungs).chain([&base]);
+        let Some(rung) = rungs.find(|rung| rung.id == only) else {
+            let mut names: Vec<&str> =
+                all.iter().flat_map(|ladder| &ladder.rungs).map(|rung| rung.id.as_str()).collect();
+            names.dedup();
+            let help = format!("the rungs are {}", names.join(", "));
+            return Err(Error::usage(format!("--only {only}: there is no such rung"), help));
+        };
+        match self.record(rung, only)? {
+            Some(_) => Ok(()),
+            None => Err(Error::Interrupted { message: format!("interrupted in {only}"), help: None }),
+        }
     }
 
     fn subject(&self, command: &BenchAccuracy, missing: usize) -> Subject {

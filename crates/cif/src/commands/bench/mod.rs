@@ -127,6 +127,31 @@ impl From<StageName> for Stage {
     }
 }
 
+/// Words of a bench, from its name on.
+#[derive(Debug, clap::Parser)]
+struct Line {
+    #[command(subcommand)]
+    what: What,
+}
+
+/// Parts of a bench that are jobs of their own, with its captures in `folder`.
+///
+/// # Errors
+/// When the words are not understood, or the bench has no parts.
+pub(super) fn parts(words: &[String], folder: &std::path::Path) -> Result<Vec<cif_batch::Part>, Error> {
+    use clap::Parser;
+
+    let line = std::iter::once("cif bench").chain(words.iter().map(String::as_str));
+    match Line::try_parse_from(line).map_err(Error::plain)?.what {
+        What::Accuracy(command) => accuracy::parts(&command.within(folder)),
+        What::Compare(command) => compare::parts(&command.within(folder)),
+        What::Step(_) | What::Export(_) | What::Hardness(_) => Err(Error::usage(
+            format!("cif bench {} has no parts", words.first().map_or("", String::as_str)),
+            "benches of a plan are accuracy and compare; others are a [[step]] with each = \"batch\"",
+        )),
+    }
+}
+
 pub(super) fn run(command: &Bench) -> Result<(), Error> {
     match &command.what {
         What::Step(command) => step(command),

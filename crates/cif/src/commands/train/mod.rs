@@ -81,6 +81,9 @@ pub(super) struct Train {
     #[arg(long, conflicts_with_all = ["force", "preset", "config", "set"], conflicts_with = "settings",
         group = "goes_on")]
     resume: bool,
+    /// As --resume where SCENE.cif holds an interrupted run, begun with the same command; for jobs of `cif batch`
+    #[arg(long, hide = true, conflicts_with_all = ["resume", "from"])]
+    resume_if_begun: bool,
     /// Continue although images, masks, cameras, points or labels of the capture have changed since the run began; with
     /// --from, although its images have
     #[arg(long, requires = "goes_on")]
@@ -214,13 +217,15 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     interrupt::set_last_words("interrupted; nothing was saved");
     // Everything that can be refused is refused before the first image is read.
     check_outputs(command)?;
-    let existing = if command.force || command.resume { Existing::Replace } else { Existing::Keep };
+    let resumes =
+        command.resume || (command.resume_if_begun && crate::destination::is_unfinished(&command.output));
+    let existing = if command.force || resumes { Existing::Replace } else { Existing::Keep };
     let mut destination = Destination::open(&command.output, existing)?;
-    let mut checkpoint = command.resume.then(|| load_state(&command.output)).transpose()?;
+    let mut checkpoint = resumes.then(|| load_state(&command.output)).transpose()?;
     if command.accept_changes {
         checkpoint.iter_mut().for_each(cif_train::accept_changes);
     }
-    if command.resume {
+    if resumes {
         interrupt::set_last_words("interrupted; the saved state is as it was");
     }
     let progress = Arc::new(Mutex::new(Progress::new(command.quiet)));
@@ -317,7 +322,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
         command.backend.apply(gpu.as_ref(), &mut trainer)?;
     }
 
-    shown(&progress).log_to(command.log.as_deref(), command.resume)?;
+    shown(&progress).log_to(command.log.as_deref(), resumes)?;
     train(command, &timing, trainer, &mut destination, &progress, watch.as_deref())
 }
 

@@ -11,10 +11,10 @@ mod video;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use cif_batch::Part;
 use cif_bench::comparison::page::{self, Comparison};
 use cif_bench::comparison::queries::Answer;
 use cif_bench::comparison::record::Row;
-use cif_bench::comparison::run::Subject;
 use cif_bench::comparison::{ABLATIONS, Contender};
 use cif_bench::records::Records;
 use cif_dataset::{Dataset, Layout, Split};
@@ -67,24 +67,15 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
     if command.video {
         video::check()?;
     }
+    if let Some(only) = &command.only {
+        return part(command, &captures, &contenders, maps, only);
+    }
     // Two at once would replace each other's records.
     let _lock = crate::lock::Lock::take(&command.output.join("report.json"))?;
     let runs = Records::inside(&command.output)?;
     interrupt::watch();
     let mut bench = Bench::new(runs, command.iterations, command.budget, maps);
-    for capture in &captures {
-        for seed in 0..u64::from(command.seeds) {
-            let mut config = capture.config.clone();
-            config.seed += seed;
-            let subject = Subject {
-                capture: &capture.name,
-                dataset: &capture.dataset,
-                scored: capture.scored(),
-                config: &config,
-            };
-            bench.compare(&subject, &contenders)?;
-        }
-    }
+    bench.compare_all(&captures, command.seeds, &contenders)?;
     let heads: Vec<HeadName> = contenders.iter().filter_map(Contender::whole).collect();
     let of_run = (&*command.output, command.models.as_deref());
     let ask = |questions: &Vec<_>| answers::ask(&mut bench, &captures, questions, &heads, of_run);
@@ -129,6 +120,76 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
     }
     Ok(())
 }
+
+/// Does one part alone, beside others that other processes do.
+fn part(
+    command: &BenchCompare,
+    captures: &[Capture],
+    contenders: &[Contender],
+    maps: BTreeMap<String, PathBuf>,
+    only: &str,
+) -> Result<(), Error> {
+    let names = |capture: &Capture| parts_of(&capture.name, capture.config.seed, command.seeds, contenders);
+    let names: Vec<String> = captures.iter().flat_map(names).map(|part| part.name).collect();
+    if !names.iter().any(|name| name == only) {
+        let help = format!("the parts are {}", names.join(", "));
+        return Err(Error::usage(format!("--only {only}: there is no such part"), help));
+    }
+    let runs = Records::inside(&command.output)?;
+    let _lock = crate::lock::Lock::take(&runs.file(&format!("{only}.json")))?;
+    interrupt::watch();
+    let mut bench = Bench::new(runs, command.iterations, None, maps);
+    bench.only = Some(only.to_owned());
+    bench.compare_all(captures, command.seeds, contenders)?;
+    match bench.ended {
+        Some(_) => Err(Error::Interrupted { message: format!("interrupted in {only}"), help: None }),
+        None => Ok(()),
+    }
+}
+
+/// Parts of a capture that are jobs of their own: a reconstruction per seed, and what is trained on it.
+fn parts_of(capture: &str, seed: u64, seeds: u32, contenders: &[Contender]) -> Vec<Part> {
+    let mut parts = Vec::new();
+    for seed in (seed..).take(seeds as usize) {
+        let base = parts.len();
+        parts.push(Part { name: runs::id(capture, seed, BASE), needs: Vec::new() });
+        let trained = contenders.iter().map(|contender| runs::id(capture, seed, contender.name()));
+        parts.extend(trained.map(|name| Part { name, needs: vec![base] }));
+    }
+    parts
+}
+
+/// Parts of a comparison; captures are not read.
+///
+/// # Errors
+/// When a folder is no capture, or settings do not fit.
+pub(in crate::commands) fn parts(command: &BenchCompare) -> Result<Vec<Part>, Error> {
+    let file = command.queries.as_deref().map(questions::File::read).transpose()?;
+    if file.is_some() {
+        return Err(Error::usage(
+            "questions are asked of all runs together, so that they are no parts of a plan",
+            "leave --queries out of the plan, and run the same comparison with it when the batch is done",
+        ));
+    }
+    let contenders = contenders(command, false)?;
+    let mut all: Vec<Part> = Vec::new();
+    for path in &command.captures {
+        let layout =
+            command.capture_options.layout_after(path, |layout| base_config(command, layout).map(drop))?;
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let begin = all.len();
+        let of_capture = parts_of(&name, base_config(command, layout)?.seed, command.seeds, &contenders);
+        all.extend(
+            of_capture
+                .into_iter()
+                .map(|part| Part { needs: part.needs.iter().map(|need| need + begin).collect(), ..part }),
+        );
+    }
+    Ok(all)
+}
+
+/// Name of the reconstruction among parts.
+const BASE: &str = "base";
 
 /// Scores of every run, and its answers to questions.
 #[derive(Serialize)]

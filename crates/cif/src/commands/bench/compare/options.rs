@@ -98,6 +98,9 @@ pub(in crate::commands::bench) struct BenchCompare {
     /// Any setting by its key in SCENE.train.toml, e.g. --set head.camera=cam16
     #[arg(long, value_name = "TABLE.KEY=VALUE")]
     pub(super) set: Vec<String>,
+    /// Do this part alone and write no page, as in --only table.seed0.cif; for jobs of `cif batch`
+    #[arg(long, value_name = "CAPTURE.seedN.HEAD", conflicts_with_all = ["queries", "video", "budget"])]
+    pub(super) only: Option<String>,
     /// Write into a folder that holds other files already
     #[arg(long)]
     pub(super) force: bool,
@@ -119,6 +122,14 @@ fn iterations(text: &str) -> Result<Iterations, String> {
             Ok(steps) if (1..=1_000_000).contains(&steps) => Ok(Iterations::Steps(steps)),
             _ => Err("expected a number of steps from 1 to 1000000, or `published`".to_owned()),
         },
+    }
+}
+
+impl BenchCompare {
+    /// The same with captures in a folder, where their paths are relative.
+    pub(in crate::commands) fn within(mut self, folder: &std::path::Path) -> Self {
+        self.captures.iter_mut().for_each(|capture| *capture = folder.join(&*capture));
+        self
     }
 }
 

@@ -15,6 +15,7 @@ use cif_geometry::PixelGrid;
 use cif_train::metrics::FrameView;
 use cif_train::{HeadName, Stop, TrainConfig};
 
+use super::capture::Capture;
 use super::options::Iterations;
 use crate::commands::shared::table::number;
 use crate::error::Error;
@@ -42,6 +43,8 @@ pub(super) struct Bench {
     /// Time after which no run begins; `None` without a budget.
     deadline: Option<Instant>,
     is_terminal: bool,
+    /// The only part that is done.
+    pub(super) only: Option<String>,
 }
 
 impl Bench {
@@ -60,7 +63,36 @@ impl Bench {
             ended: None,
             deadline: budget.and_then(|budget| Instant::now().checked_add(budget)),
             is_terminal: std::io::stderr().is_terminal(),
+            only: None,
         }
+    }
+
+    /// Runs everything on all captures and seeds.
+    pub(super) fn compare_all(
+        &mut self,
+        captures: &[Capture],
+        seeds: u32,
+        contenders: &[Contender],
+    ) -> Result<(), Error> {
+        for capture in captures {
+            for seed in 0..u64::from(seeds) {
+                let mut config = capture.config.clone();
+                config.seed += seed;
+                let subject = Subject {
+                    capture: &capture.name,
+                    dataset: &capture.dataset,
+                    scored: capture.scored(),
+                    config: &config,
+                };
+                self.compare(&subject, contenders)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// True where a part is to be done.
+    fn is_wanted(&self, id: &str) -> bool {
+        self.only.as_ref().is_none_or(|only| only == id)
     }
 
     /// Runs everything on a capture with a seed. Once the comparison has ended, what is kept is taken and the rest
@@ -69,8 +101,14 @@ impl Bench {
         let stop = Stop::when(interrupt::requested);
         let heading = format!("{}, seed {}", subject.capture, subject.config.seed);
         let mut base = None;
+        if self.only.as_ref() == Some(&subject.id()) {
+            base = self.reconstruct(subject, &heading, &stop)?;
+        }
         let inputs = self.inputs(subject, contenders);
         for contender in contenders {
+            if !self.is_wanted(&id(subject.capture, subject.config.seed, contender.name())) {
+                continue;
+            }
             let Some(config) = self.settings(subject, *contender) else { continue };
             let id = id(subject.capture, config.seed, contender.name());
             let mut fingerprint = inputs.clone();
@@ -91,9 +129,7 @@ impl Bench {
                 Kept::Missing => {}
             }
             if base.is_none() && self.begins() {
-                let progress = &mut |done, whole| self.show_share(&heading, "reconstruction", done, whole);
-                base = subject.reconstruct(&self.runs, &stop, progress)?;
-                self.ended = base.is_none().then_some(Ended::Interrupted);
+                base = self.reconstruct(subject, &heading, &stop)?;
             }
             let trained = match base.as_ref().filter(|_| self.begins()) {
                 Some(base) => {
@@ -123,6 +159,19 @@ impl Bench {
             self.records.push(record);
         }
         Ok(())
+    }
+
+    /// The reconstruction of a capture with a seed; `None` when interrupted.
+    fn reconstruct(
+        &mut self,
+        subject: &Subject<'_>,
+        heading: &str,
+        stop: &Stop,
+    ) -> Result<Option<cif_field::Checkpoint>, Error> {
+        let progress = &mut |done, whole| self.show_share(heading, "reconstruction", done, whole);
+        let base = subject.reconstruct(&self.runs, stop, progress)?;
+        self.ended = base.is_none().then_some(Ended::Interrupted);
+        Ok(base)
     }
 
     /// Inputs that all runs on a capture with a seed are made from.
