@@ -8,6 +8,9 @@ WHEELS := target/wheels
 TEST_BIN := $(VENV)/tests/bin
 TEST_WHEELS := target/test-wheels
 DIST := target/dist
+# What `make dist` builds in, and the tools that only it needs.
+DIST_SOURCE := target/dist-source
+DIST_TOOLS := target/dist-tools
 OUT ?= out/demo
 DEMO_CAPTURE := examples/tabletop-mini
 DEMO_LABEL := red mug
@@ -16,8 +19,13 @@ DEMO_LABEL := red mug
 MATURIN := maturin==1.16.0
 PYTEST := pytest==9.2.0
 RUFF := ruff==0.17.5
+# Makes the site of the pages.
+MDBOOK := 0.5.4
 # A C compiler that links against the symbols of any glibc; the machine's own takes those of its own.
 ZIG := ziglang==0.17.1
+# Licences and the SBOM of what is inside the wheels.
+CARGO_ABOUT := cargo-about@0.9.3
+CARGO_CYCLONEDX := cargo-cyclonedx@0.5.9
 # The USD of the tests; any since 26.3 will do, see pyproject.toml.
 USD := usd-core==26.11
 # Its library runs the models of tests of cif-vision; nothing else of it is needed (17 MB).
@@ -28,6 +36,7 @@ MUJOCO := mujoco[usd]==4.0.0
 NEWTON := newton==1.8.0 newton-usd-schemas==0.6.0 warp-lang==1.19.0 usd-core==26.8 scipy numpy
 VALIDATOR := omniverse-asset-validator==1.18.0 usd-core==26.8
 SIMREADY := simready-foundation-tier-core==2026.8.0 usd-core==26.8
+OPENJD := openjd-cli==0.8.0
 PYCOLMAP := pycolmap==4.2.1
 # Drives the browser that is installed; Pillow reads its pictures.
 PLAYWRIGHT := playwright==1.65.2 pillow numpy
@@ -36,11 +45,13 @@ BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13 b
 # One interpreter for every build, or PyO3 is built again.
 export PYO3_PYTHON := $(abspath $(BIN)/python)
 
-.PHONY: help build wheel demo plugin stubs docs test test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-simready test-page test-blender test-capture fuzz lint lint-format lint-page format clean
+.PHONY: help build wheel dist demo plugin stubs docs site test test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-simready test-batch test-page test-blender test-capture test-dist fuzz lint lint-format lint-page format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
 	@echo "make wheel   a wheel for other machines, into $(DIST): Linux with glibc 2.28 or newer; zig is downloaded (100 MB)"
+	@echo "make dist    all that is published of the last commit, into $(DIST): wheels, the Blender extension, sources, SBOM,"
+	@echo "             licences, checksums; ARCHS= names machines (x86_64 aarch64); tools are downloaded and built"
 	@echo "make demo    train, evaluate, export, query and render the small capture into $(OUT)"
 	@echo "make plugin  the Blender extension, into out/"
 	@echo "make test    all tests but the long ones, Rust and Python"
@@ -49,10 +60,13 @@ help:
 	@echo "make test-mujoco, test-newton, test-blender   tests with these tools, which are downloaded (75 MB, 300 MB, 1.5 GB)"
 	@echo "make test-validator   NVIDIA's validator on our stages, which is downloaded (50 MB)"
 	@echo "make test-simready   NVIDIA's SimReady features of our stages, which are downloaded (100 MB)"
+	@echo "make test-batch  jobs of cif batch in OpenJD, which is downloaded (5 MB), and in Slurm and HyperQueue where they are there"
 	@echo "make test-page   the page of cif view in an installed Chromium; Playwright is downloaded (50 MB)"
 	@echo "make test-capture   tests of cif capture with pycolmap, which is downloaded (50 MB), and ffmpeg where it is there"
+	@echo "make test-dist   what make dist made, in empty environments of Python 3.10, 3.11 and 3.13, and in containers"
 	@echo "make stubs   docstrings of the Python module into its stub"
 	@echo "make docs    the pages of docs/reference, generated from the code"
+	@echo "make site    the pages of docs as a site, into target/site; mdBook is built where it is not there"
 	@echo "make lint    formatting and lints, as in CI"
 	@echo "make lint-page   types of the page's script; needs node, TypeScript is downloaded"
 	@echo "make format  put the formatting right"
@@ -82,6 +96,19 @@ wheel: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/maturin build --release --zig --compatibility manylinux_2_28 \
 		--interpreter $(BIN)/python --out $(DIST)
 	@echo "built: $$(echo $(DIST)/*.whl)"
+
+# Built from source, because that is the form in which their authors publish them on crates.io.
+$(DIST_TOOLS)/.tools-$(CARGO_ABOUT)-$(CARGO_CYCLONEDX):
+	cargo install --locked --root $(DIST_TOOLS) --features cli $(CARGO_ABOUT)
+	cargo install --locked --root $(DIST_TOOLS) $(CARGO_CYCLONEDX)
+	@rm -f $(DIST_TOOLS)/.tools-*
+	@touch "$@"
+
+ARCHS ?=
+dist: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF) $(DIST_TOOLS)/.tools-$(CARGO_ABOUT)-$(CARGO_CYCLONEDX)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(ZIG)"
+	ARCHS="$(ARCHS)" PATH="$(abspath $(BIN)):$(abspath $(DIST_TOOLS)/bin):$$PATH" \
+		packaging/dist.sh $(DIST) $(DIST_SOURCE)
 
 demo: build
 	@mkdir -p $(OUT)
@@ -167,6 +194,12 @@ test-simready: test-wheel
 	$(VENV)/simready/bin/python -m pip install --quiet --disable-pip-version-check $(SIMREADY)
 	CIF_TEST_SIMREADY=$(VENV)/simready/bin/python $(TEST_BIN)/python -m pytest tests/python/test_simready.py
 
+# Jobs of cif batch in OpenJD, and in Slurm and HyperQueue where these are installed.
+test-batch: test-wheel
+	test -x $(VENV)/openjd/bin/python || $(PYTHON) -m venv $(VENV)/openjd
+	$(VENV)/openjd/bin/python -m pip install --quiet --disable-pip-version-check $(OPENJD)
+	CIF_TEST_OPENJD=$(abspath $(VENV)/openjd/bin/openjd) $(TEST_BIN)/python -m pytest tests/python/test_batch.py
+
 # CIF_TEST_CHROMIUM names the browser, else it is searched for on the PATH; CIF_TEST_PAGE=require fails without one.
 test-page: test-wheel
 	test -x $(VENV)/page/bin/python || $(PYTHON) -m venv $(VENV)/page
@@ -190,6 +223,11 @@ test-blender:
 		$$folder/bin/python -m pytest --noconftest tests/python/test_blender_scene.py; \
 	done
 
+# Needs no build of its own. What a machine lacks is skipped, and named: Pythons, containers, Blender.
+test-dist: export CIF_TEST_DIST := $(abspath $(DIST))
+test-dist: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
+	$(BIN)/python -m pytest --noconftest tests/python/test_dist.py
+
 lint: lint-format
 	cargo clippy --locked --workspace --all-targets -- -D warnings
 
@@ -203,6 +241,17 @@ lint-format: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 lint-page:
 	npx --yes --package typescript@5.9.3 tsc --noEmit --checkJs --strict --target es2022 --module es2022 \
 		--lib es2022,dom,dom.iterable --moduleResolution bundler plugin/web/src/*.js
+
+# mdBook is a tool of this target alone: that on the PATH is taken where it has the version.
+MDBOOK_ROOT := target/mdbook-$(MDBOOK)
+site:
+	$(PYTHON) docs/site.py
+	@if [ "$$(mdbook --version 2>/dev/null)" = "mdbook v$(MDBOOK)" ]; then mdbook build target/book; else \
+		test -x $(MDBOOK_ROOT)/bin/mdbook \
+			|| cargo install --quiet --locked --root $(MDBOOK_ROOT) mdbook@$(MDBOOK) || exit 1; \
+		$(MDBOOK_ROOT)/bin/mdbook build target/book; \
+	fi
+	@echo "built: target/site/index.html"
 
 stubs: # after make test-wheel
 	$(TEST_BIN)/python crates/cif-python/stubs.py

@@ -8,6 +8,7 @@ import zipfile
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parent / "cif_scene"
+LICENCE = PACKAGE.parents[2] / "LICENSE"
 EPOCH = (1980, 1, 1, 0, 0, 0)
 """Time of every entry, so that the same sources give the same file."""
 
@@ -22,9 +23,10 @@ def build(folder: Path) -> Path:
     files = sorted(
         path for path in PACKAGE.rglob("*") if path.suffix in (".py", ".toml", ".md") and path.is_file()
     )
+    entries = {path.relative_to(PACKAGE).as_posix(): path for path in files} | {LICENCE.name: LICENCE}
     with zipfile.ZipFile(scratch, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path in files:
-            entry = zipfile.ZipInfo(path.relative_to(PACKAGE).as_posix(), EPOCH)
+        for name, path in entries.items():
+            entry = zipfile.ZipInfo(name, EPOCH)
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = 0o644 << 16
             archive.writestr(entry, path.read_bytes())

@@ -109,10 +109,21 @@ fn last_words() -> &'static str {
 
 /// From here on a signal asks the command to stop; the process ends 1.5 seconds later at the latest.
 pub fn watch() {
+    watch_as(false);
+}
+
+/// From here on a signal asks the command to stop and to save what it has; a second one ends the process.
+pub fn watch_and_save() {
+    watch_as(true);
+}
+
+/// Watches for a command that saves, or does not: several may run one after the other.
+fn watch_as(saves: bool) {
     // Elsewhere signals belong to others.
     if !is_own_process() {
         return;
     }
+    SAVES.store(saves, Ordering::SeqCst);
     HANDLER.get_or_init(|| {
         ctrlc::set_handler(|| {
             if REQUESTS.request() {
@@ -128,12 +139,6 @@ pub fn watch() {
         })
         .is_ok()
     });
-}
-
-/// From here on a signal asks the command to stop and to save what it has; a second one ends the process.
-pub fn watch_and_save() {
-    SAVES.store(true, Ordering::SeqCst);
-    watch();
 }
 
 /// True where the command is asked to stop.

@@ -22,11 +22,13 @@
 //! | [`words`] | words of a text, matched with the names of objects |
 //! | [`evaluation`] | scores of a scene on a capture, as they are reported |
 //! | [`ground_truth`] | exported motion against known motion |
+//! | `program` | the program that this process runs, which it starts again for jobs and models |
 //! | `report` | reports as JSON: where they go |
 //! | `moment` | times as they are typed |
 //! | `endings` | names of outputs, and what they may end in |
 //! | `messages` | notes and outcomes on stderr, and who wants none |
 //! | `streams` | stdout and stderr, whose readers may leave |
+//! | `version` | what `cif --version` says |
 //! | [`error`] | what is reported, and the exit code |
 
 // Its macros stand in for those of the standard library in all modules below.
@@ -52,11 +54,13 @@ mod messages;
 mod moment;
 pub mod output;
 pub mod pictures;
+mod program;
 pub mod progress;
 mod report;
 pub mod settings;
 pub mod starting_points;
 pub mod training;
+mod version;
 pub mod words;
 
 use std::ffi::OsString;
@@ -74,13 +78,15 @@ pub use error::Error;
 /// Python run in it, and so do models, each in a process of its own.
 pub fn set_python(program: PathBuf, packages: PathBuf) {
     cif_capture::structure::set_python(program.clone());
-    cif_vision::runtime::run_apart(move || {
-        // A program may have added the folder to its own search path alone.
-        let script = format!(
-            "sys.path.append(sys.argv[1]); import cif4d; sys.argv = ['cif', '{RUN_MODEL}']; sys.exit(cif4d.main())"
-        );
-        let mut command = cif_system::python::script(&program, &script);
-        command.arg(&packages);
+    program::set_python(program, packages);
+    run_models_apart();
+}
+
+/// Models are run in processes of their own.
+fn run_models_apart() {
+    cif_vision::runtime::run_apart(|| {
+        let mut command = program::command();
+        command.arg(RUN_MODEL);
         command
     });
 }
@@ -91,13 +97,8 @@ pub fn set_python(program: PathBuf, packages: PathBuf) {
 ///
 /// Models are run by the same program in processes of their own, unless [`set_python`] was called before.
 pub fn own_process() {
-    if let Ok(program) = std::env::current_exe() {
-        cif_vision::runtime::run_apart(move || {
-            let mut command = std::process::Command::new(&program);
-            command.arg(RUN_MODEL);
-            command
-        });
-    }
+    program::set_own();
+    run_models_apart();
     interrupt::own_process();
 }
 

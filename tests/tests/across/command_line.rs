@@ -50,6 +50,7 @@ fn help_teaches_the_tool() {
     let folder = folder();
     let help = cif(folder.path(), "--help").succeeds().stdout;
     for word in [
+        "demo",
         "capture",
         "train",
         "eval",
@@ -68,6 +69,7 @@ fn help_teaches_the_tool() {
         assert!(help.contains(word), "{word} in {help}");
     }
     let commands = [
+        "demo",
         "train",
         "eval",
         "render",
@@ -86,8 +88,17 @@ fn help_teaches_the_tool() {
         let help = cif(folder.path(), &format!("{command} --help")).succeeds().stdout;
         assert!(help.contains("Usage: cif"), "{help}");
     }
-    let version = cif(folder.path(), "--version").succeeds().stdout;
-    assert_eq!(version.trim(), concat!("cif ", env!("CARGO_PKG_VERSION")));
+    let short = cif(folder.path(), "-V").succeeds().stdout;
+    assert_eq!(short, concat!("cif ", env!("CARGO_PKG_VERSION"), "\n"));
+    let long = cif(folder.path(), "--version").succeeds().stdout;
+    let rows: Vec<&str> = long.strip_prefix(&short).expect("the same first line").lines().collect();
+    let named = |name: &str| rows.iter().find_map(|row| row.strip_prefix(name)).map(str::trim);
+    assert!(named("features").is_some_and(|value| !value.is_empty()), "{long}");
+    assert!(named("SIMD").is_some_and(|value| !value.is_empty()), "{long}");
+    if let Some(commit) = named("commit") {
+        let hash = commit.strip_suffix("-dirty").unwrap_or(commit);
+        assert!(hash.len() >= 7 && hash.chars().all(|letter| letter.is_ascii_hexdigit()), "{long}");
+    }
 }
 
 #[test]

@@ -6,7 +6,7 @@ use std::process::Command;
 use serde_json::Value;
 
 /// Row of every crate; 0 is the lowest.
-const ROWS: [(&str, u32); 20] = [
+const ROWS: [(&str, u32); 21] = [
     ("cif-geometry", 0),
     ("cif-output", 0),
     ("cif-input", 0),
@@ -16,6 +16,7 @@ const ROWS: [(&str, u32); 20] = [
     ("cif-vision", 1),
     ("cif-render", 2),
     ("cif-masks", 2),
+    ("cif-batch", 2),
     ("cif-capture", 2),
     ("cif-train", 3),
     ("cif-scene", 3),

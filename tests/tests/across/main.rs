@@ -3,11 +3,13 @@
 #![allow(clippy::unwrap_used)] // Helpers of tests.
 
 mod accuracy;
+mod batch;
 mod bench;
 mod check;
 mod command_line;
 mod compare;
 mod conventions;
+mod demo;
 mod dependency_direction;
 mod determinism;
 mod edits;

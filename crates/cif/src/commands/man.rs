@@ -26,7 +26,8 @@ pub(super) struct Man {
 
 /// `arguments` is the parser of the command line.
 pub(super) fn run(command: &Man, arguments: clap::Command) -> Result<(), Error> {
-    let mut root = arguments.disable_help_subcommand(true);
+    // The long version is that of this machine.
+    let mut root = arguments.disable_help_subcommand(true).long_version(None::<&'static str>);
     root.build();
     let mut pages = Vec::new();
     collect(&root, &mut pages)?;

@@ -1,9 +1,11 @@
 //! The subcommands, a file or a folder each; `shared` holds what several of them use.
 
+mod batch;
 mod bench;
 mod capture;
 mod check;
 mod completions;
+mod demo;
 mod diff;
 mod embed;
 mod eval;
@@ -28,7 +30,7 @@ use clap::{Args, CommandFactory, Parser, Subcommand};
 #[cfg(feature = "wgpu")]
 use crate::backend;
 use crate::error::Error;
-use crate::{messages, report};
+use crate::{messages, report, version};
 
 /// From captured images to an editable, segmented 3D scene.
 #[derive(Debug, Parser)]
@@ -36,6 +38,7 @@ use crate::{messages, report};
     name = "cif",
     bin_name = "cif",
     version,
+    long_version = version::long(),
     max_term_width = 110,
     arg_required_else_help = true,
     subcommand_required = true,
@@ -53,6 +56,7 @@ pub struct Arguments {
 
 const TOUR: &str = "\
 A short tour:
+  cif demo                                               see it work, on an example that comes with it
   cif make phone.mp4 -o table                            all steps, from a video to a USD stage
   cif capture walk.mp4 -o captures/table                 frames and cameras out of a video or photographs
   cif info captures/table                                what is in this folder?
@@ -66,6 +70,7 @@ A short tour:
   cif query table.usda --text 'something to drink from'  what could that be? (with cif embed, by meaning)
   cif label table.usda --instance 3 'blue mug'           give it another name
   cif check table.cif                                    is it numerically sound?
+  cif batch plan.toml                                    many captures, settings and seeds, here or on a farm
 
 A capture is a folder in the layout of HyperNeRF, DyCheck, Neu3D, D-NeRF, Dynamic 3D Gaussians (CMU
 Panoptic), LLFF sequences (NSFF, EndoNeRF), nerfstudio or COLMAP, with instance masks (PNG, value =
@@ -82,6 +87,7 @@ Exit code: 0 done, 1 failed, 2 wrong arguments, 130 interrupted.
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Demo(demo::Demo),
     Make(make::Make),
     Capture(capture::Capture),
     Plan(plan::Plan),
@@ -99,6 +105,7 @@ enum Command {
     Check(check::Check),
     Masks(masks::Masks),
     Bench(bench::Bench),
+    Batch(batch::BatchCommand),
     Completions(completions::Completions),
     Man(man::Man),
     /// Run a model for another process of cif, which asks on the standard input
@@ -162,6 +169,7 @@ pub fn advice(error: &clap::Error, arguments: &[OsString]) -> Option<String> {
 /// Runs one command on the threads that are there.
 fn dispatch(command: Command) -> Result<(), Error> {
     match command {
+        Command::Demo(command) => demo::run(&command, run_line),
         Command::Make(command) => make::run(&command, run_line),
         Command::Capture(command) => capture::run(&command),
         Command::Plan(command) => plan::run(&command),
@@ -179,6 +187,7 @@ fn dispatch(command: Command) -> Result<(), Error> {
         Command::Check(command) => check::run(&command),
         Command::Masks(command) => masks::run(&command),
         Command::Bench(command) => bench::run(&command),
+        Command::Batch(command) => batch::run(&command),
         Command::Completions(command) => completions::run(&command, Arguments::command()),
         Command::Man(command) => man::run(&command, Arguments::command()),
         Command::RunModel => cif_vision::runtime::serve(std::io::stdin().lock(), std::io::stdout().lock())

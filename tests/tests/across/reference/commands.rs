@@ -12,8 +12,9 @@ const HEAD: &str = "\
 
 Generated from the help of the command by `make docs`; do not edit.
 
-Every command prints this text with `--help`, and a summary with `-h`; `cif --version` prints the version. The options
-of `cif` itself may stand after any command.
+Every command prints this text with `--help`, and a summary with `-h`. `cif -V` prints the version, `cif --version` also
+the commit that was built, what was built in, and the vector instructions that this machine has. The options of `cif`
+itself may stand after any command.
 ";
 
 /// The page.

@@ -12,6 +12,7 @@ use serde::Serialize;
 
 use self::record::{Record, State};
 use crate::commands::shared::command_line;
+use crate::commands::shared::step::{RunLine, step};
 use crate::error::Error;
 use crate::report::{JsonReport, OnlyReport};
 
@@ -86,9 +87,6 @@ struct MakeReport<'a> {
 impl JsonReport for MakeReport<'_> {
     const COMMANDS: &'static [&'static str] = &["cif make"];
 }
-
-/// Runs a command line of cif.
-type RunLine = fn(Vec<OsString>) -> Result<(), Error>;
 
 pub(super) fn run(command: &Make, run_line: RunLine) -> Result<(), Error> {
     command.report.check([])?;
@@ -317,14 +315,6 @@ fn version() -> MadeFrom {
 
 /// Keeps a command from printing the next step, which is printed here.
 const STEP: Option<&str> = Some("--step");
-
-/// Runs a command line of cif, and shows it without the flag `hidden`.
-fn step(run_line: RunLine, words: Vec<OsString>, hidden: Option<&str>) -> Result<(), Error> {
-    let shown: Vec<String> = words.iter().map(|word| word.to_string_lossy().into_owned()).collect();
-    eprintln!("$ {}", command_line(&shown));
-    let line = std::iter::once(OsString::from("cif")).chain(words).chain(hidden.map(OsString::from));
-    run_line(line.collect())
-}
 
 /// Frames of the first camera that are proposed to be painted: the first and the last, and some between.
 fn proposed(dataset: &Dataset) -> Vec<usize> {

@@ -13,6 +13,7 @@
 //! | [`scene`] | how scenes are read, and how they were trained |
 //! | [`simd`] | which vector instructions are used |
 //! | [`split`] | which frames are meant |
+//! | [`step`] | how a command runs and shows others |
 //! | [`table`] | how tables look |
 //! | [`trajectories`] | which lines the paths of moving objects are in a view |
 
@@ -27,6 +28,7 @@ pub(in crate::commands) mod object_motion;
 pub(crate) mod scene;
 pub(in crate::commands) mod simd;
 pub(in crate::commands) mod split;
+pub(in crate::commands) mod step;
 pub(in crate::commands) mod table;
 pub(in crate::commands) mod trajectories;
 
