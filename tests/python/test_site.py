@@ -195,6 +195,15 @@ def exported(name: str) -> Callable[[Path], None]:
     return write
 
 
+def plan(folder: Path) -> None:
+    """Writes the plan of the page on batches, with a few steps, one preset and one seed."""
+    text = blocks(DOCS / "batch.md", "toml")[0]
+    steps = " ".join(f"--iterations-{stage} 5" for stage in ("coarse", "fine", "instance"))
+    text = re.sub(r"(preset|seed) = \[(.*?),.*\]", r"\1 = [\2]", text)
+    text = text.replace("[train]", f'[train]\noptions = "{steps} --downscale 2 --effects none,+instances"')
+    (folder / "plan.toml").write_text(text)
+
+
 GIVEN: dict[str, Callable[[Path], object]] = {
     "examples": lambda folder: (folder / "examples").symlink_to(ROOT / "examples"),
     "captures": lambda folder: (folder / "captures").mkdir(),
@@ -206,6 +215,7 @@ GIVEN: dict[str, Callable[[Path], object]] = {
     "table_edits.usda": edits_of("table_edits.usda"),
     "fallen.usda": edits_of("fallen.usda"),
     "fox.ply": exported("fox.ply"),
+    "plan.toml": plan,
 }
 """What commands of pages find: the name there, and what makes it in a folder that has a trained table.cif."""
 

@@ -140,7 +140,11 @@ fn captures(plan: &Plan) -> Result<Vec<Capture>, Error> {
             .map_err(|error| refused(format!("`{pattern}` is no pattern: {error}"), "as in captures/*"))?;
         let before = found.len();
         for path in paths.filter_map(Result::ok).filter(|path| path.is_dir()) {
-            let name = file_name(&path.canonicalize().map_err(Error::io("find", &path))?);
+            let name = match path.file_name() {
+                Some(name) => name.to_string_lossy().into_owned(),
+                // As of `.`.
+                None => file_name(&path.canonicalize().map_err(Error::io("find", &path))?),
+            };
             check_name(&name).map_err(|problem| refused(problem, "rename the folder of the capture"))?;
             let path = path.strip_prefix(folder).map_or(path.clone(), Path::to_owned);
             if found.iter().any(|capture| capture.path == path) {
