@@ -16,6 +16,8 @@ pub struct Part {
     pub name: String,
     /// Parts that come first, by index.
     pub needs: Vec<usize>,
+    /// Capture that it reads, from the folder of the plan.
+    pub capture: PathBuf,
 }
 
 /// What takes benches apart.
@@ -60,7 +62,6 @@ pub fn expand(plan: &Plan, benches: &dyn Benches) -> Result<Batch, Error> {
         output: plan.output.clone(),
         steps: Vec::new(),
         jobs: Vec::new(),
-        capture_options: plan.capture_options.0.clone(),
         engines: plan.engines.clone(),
     };
     let mut each_of = Vec::new();
@@ -336,7 +337,8 @@ fn add_bench(
             place[k] = batch.jobs.len();
             let needs = part.needs.iter().map(|need| place[*need]).collect();
             let words = [&words[..], &["--only".to_owned(), part.name.clone()]].concat();
-            batch.jobs.push(job(format!("{name}/{}", part.name), step, words, needs));
+            let job = job(format!("{name}/{}", part.name), step, words, needs);
+            batch.jobs.push(Job { capture: Some(part.capture.clone()), ..job });
         }
         let needs = (first_step..step).collect();
         let jobs = first..batch.jobs.len();
@@ -358,7 +360,11 @@ mod tests {
     impl Benches for TwoLayers {
         fn parts(&self, words: &[String], _: &Path) -> Result<Vec<Part>, Error> {
             assert_eq!(words, ["compare", "a", "-o", "results/compare"]);
-            let part = |name: &str, needs: &[usize]| Part { name: name.to_owned(), needs: needs.to_vec() };
+            let part = |name: &str, needs: &[usize]| Part {
+                name: name.to_owned(),
+                needs: needs.to_vec(),
+                capture: "a".into(),
+            };
             Ok(vec![part("base", &[]), part("cif", &[0]), part("sa4d", &[0])])
         }
     }

@@ -22,8 +22,6 @@ pub struct Batch {
     pub steps: Vec<Step>,
     /// Jobs, those of a step in a row.
     pub jobs: Vec<Job>,
-    /// Options of every command that reads a capture.
-    pub capture_options: Vec<String>,
     /// Options of the engines of farms.
     pub engines: EngineOptions,
 }
@@ -137,7 +135,6 @@ mod tests {
             output: "results".into(),
             steps: vec![step("train", 0..3), step("eval", 3..4)],
             jobs: vec![job("train/a", 0), job("train/b", 0), job("train/c", 0), job("eval/a", 1)],
-            capture_options: Vec::new(),
             engines: EngineOptions::default(),
         };
         for (text, jobs) in

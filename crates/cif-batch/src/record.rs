@@ -186,7 +186,6 @@ mod tests {
             output: "results".into(),
             steps: Vec::new(),
             jobs: vec![job.clone()],
-            capture_options: Vec::new(),
             engines: EngineOptions::default(),
         };
         let now = MadeFrom { version: "1".to_owned(), command: job.words.clone(), ..MadeFrom::default() };

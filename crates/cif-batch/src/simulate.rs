@@ -143,7 +143,6 @@ mod tests {
             output: "results".into(),
             steps: vec![step("train", 0..count, Vec::new()), step("sum", count..count + 1, vec![0])],
             jobs,
-            capture_options: Vec::new(),
             engines: EngineOptions::default(),
         };
         let spent = Spent { cpu_s: 10.0, read_bytes: 1_000_000_000, ..Spent::default() };

@@ -220,6 +220,18 @@ fn benches_are_jobs_with_the_same_tables() {
     assert!(path.join("results/accuracy/report.html").is_file());
     let page = fs::read_to_string(path.join("results/index.html")).unwrap();
     assert!(page.contains("compare/compare.html") && page.contains("accuracy/report.html"));
+    // What is made from another image is made again, and the tables with it.
+    let images = path.join("captures/a/rgb/1x");
+    let mut names: Vec<_> = fs::read_dir(images).unwrap().map(|entry| entry.unwrap().path()).collect();
+    names.sort();
+    fs::copy(&names[1], &names[0]).unwrap();
+    let again = cif(path, "batch plan.toml --list").succeeds().stdout;
+    let stale = |id: &str| {
+        again
+            .lines()
+            .any(|line| line.trim_start().starts_with(id) && line.contains("its capture has changed"))
+    };
+    assert!(stale("heads/a.seed0.base ") && stale("heads/a.seed0.cif ") && stale("ladder/base "), "{again}");
     cif(path, "bench compare captures/a -o x --heads cif --only a.seed0.sa4d")
         .fails(2, &["a.seed0.base, a.seed0.cif"]);
     cif(path, "bench accuracy captures/a -o x --ladders render --only nothing").fails(2, &["the rungs are"]);

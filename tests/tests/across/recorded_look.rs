@@ -47,6 +47,13 @@ fn pictures_have_the_exposure_of_their_camera_where_they_are_to() {
     };
     let share = brightness("recorded") / brightness("mean");
     assert!((share - 0.25).abs() < 0.02, "{share}");
+    // A camera of which training saw nothing has no recorded look.
+    let series = field.record.drawing.exposures_in_time.values().next().cloned().expect("a camera");
+    field.record.drawing.exposures_in_time = [("elsewhere".to_owned(), series)].into();
+    field.save(path.join("others.cif")).expect("the folder can be written");
+    let line = ["render", "others.cif", "--capture", CAPTURE, "--look", "recorded", "-o", "others"];
+    let (succeeded, told) = cif(path, &line);
+    assert!(succeeded && told.contains("views have the mean look"), "{told}");
     for (scene, views, why) in [
         ("plain.cif", ["--capture", CAPTURE], "learnt no exposures"),
         ("scene.cif", ["--camera", "views.json"], "--look recorded is that of a camera of a capture"),

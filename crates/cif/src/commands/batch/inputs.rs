@@ -7,7 +7,7 @@ use std::sync::{Mutex, PoisonError};
 use cif_batch::record::{MadeFrom, Record, State};
 use cif_batch::steps::COLLECT;
 use cif_batch::{Batch, Job};
-use clap::Parser;
+use clap::{CommandFactory, Parser};
 
 use crate::commands::shared::CaptureOptions;
 use crate::output;
@@ -15,10 +15,11 @@ use crate::output;
 /// Inputs of jobs; the content of each capture is found out once.
 pub(super) struct Inputs<'a> {
     batch: &'a Batch,
-    captures: Mutex<HashMap<PathBuf, String>>,
+    /// By capture and the options that say how it is read.
+    captures: Mutex<HashMap<(PathBuf, Vec<String>), String>>,
 }
 
-/// The options of a plan that say which capture is read.
+/// Options that say how a capture is read.
 #[derive(Parser)]
 struct Options {
     #[command(flatten)]
@@ -61,20 +62,23 @@ impl<'a> Inputs<'a> {
 
     /// Content of a capture, as a digest; empty where it cannot be read, which the job itself reports.
     fn content(&self, job: &Job, capture: &Path) -> String {
+        let options = capture_options(&job.words);
+        let key = (capture.to_owned(), options);
         let mut captures = self.captures.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(known) = captures.get(capture) {
+        if let Some(known) = captures.get(&key) {
             return known.clone();
         }
-        let found = self.read(job, capture).unwrap_or_default();
-        captures.insert(capture.to_owned(), found.clone());
+        let found = self.read(capture, &key.1).unwrap_or_default();
+        captures.insert(key, found.clone());
         found
     }
 
-    fn read(&self, job: &Job, capture: &Path) -> Option<String> {
-        let words = std::iter::once("cif").chain(self.batch.capture_options.iter().map(String::as_str));
-        let options = Options::try_parse_from(words).ok()?.capture.options();
-        let dataset = cif_dataset::Dataset::open(self.batch.place(capture), &options).ok()?;
-        let name = job.id.split('/').nth(1).unwrap_or_default();
+    fn read(&self, capture: &Path, options: &[String]) -> Option<String> {
+        let words = std::iter::once("cif").chain(options.iter().map(String::as_str));
+        let parsed = Options::try_parse_from(words).ok()?.capture.options();
+        let dataset = cif_dataset::Dataset::open(self.batch.place(capture), &parsed).ok()?;
+        let name = capture.file_name().unwrap_or_default().to_string_lossy();
+        let name = if options.is_empty() { name.into_owned() } else { format!("{name}-{}", digest(options)) };
         let file = self.batch.place(&self.batch.records()).join(format!(".captures/{name}.json"));
         let text = std::fs::read_to_string(&file).unwrap_or_default();
         let known: Option<cif_dataset::MadeFrom> = serde_json::from_str(&text).ok();
@@ -89,9 +93,41 @@ impl<'a> Inputs<'a> {
     }
 }
 
+/// The options of a command that say how its capture is read; they are the same for all commands.
+fn capture_options(words: &[String]) -> Vec<String> {
+    let command = Options::command();
+    let mut found = Vec::new();
+    let mut words = words.iter();
+    while let Some(word) = words.next() {
+        let Some(flag) = word.strip_prefix("--") else { continue };
+        let (name, value) = flag.split_once('=').map_or((flag, None), |(name, value)| (name, Some(value)));
+        let Some(argument) = command.get_arguments().find(|argument| argument.get_long() == Some(name))
+        else {
+            continue;
+        };
+        found.push(word.clone());
+        if argument.get_action().takes_values() && value.is_none() {
+            found.extend(words.next().cloned());
+        }
+    }
+    found
+}
+
 /// Marks that a record holds one by one, at most.
 const MANY: usize = 16;
 
 fn digest(marks: &[String]) -> String {
     cif_dataset::MadeFrom::new().value("marks", marks).digest()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::capture_options;
+
+    #[test]
+    fn options_of_captures_are_found_among_others() {
+        let line = "train table -o --masks tracked --set a=b --no-masks --downscale=2 --preset draft --help";
+        let words: Vec<String> = line.split(' ').map(str::to_owned).collect();
+        assert_eq!(capture_options(&words), ["--masks", "tracked", "--no-masks", "--downscale=2"]);
+    }
 }

@@ -181,33 +181,28 @@ fn prepare(command: &BenchAccuracy) -> Result<Prepared, Error> {
     Ok(Prepared { options, dataset, config, ladders: all })
 }
 
-/// Rungs as jobs of their own: the base first, which those that train nothing use.
+/// Rungs as jobs of their own, of a capture in a folder: the base first, which those that train nothing use.
 ///
 /// # Errors
 /// When the capture cannot be read, or has nothing to be measured.
-pub(in crate::commands) fn parts(command: &BenchAccuracy) -> Result<Vec<Part>, Error> {
+pub(in crate::commands) fn parts(command: BenchAccuracy, folder: &Path) -> Result<Vec<Part>, Error> {
     if command.quick {
         return Err(Error::usage(
             "--quick measures what fits into five minutes, so that its rungs are no jobs",
             "leave --quick out of the plan",
         ));
     }
-    let mut parts = vec![Part { name: BASE.to_owned(), needs: Vec::new() }];
-    for rung in prepare(command)?.ladders.into_iter().flat_map(|ladder| ladder.rungs) {
+    let capture = command.capture.clone();
+    let part = |name: String, needs| Part { name, needs, capture: capture.clone() };
+    let mut parts = vec![part(BASE.to_owned(), Vec::new())];
+    let command = BenchAccuracy { capture: folder.join(&capture), ..command };
+    for rung in prepare(&command)?.ladders.into_iter().flat_map(|ladder| ladder.rungs) {
         let trains = matches!(rung.work, Work::Train(_) | Work::Preset { .. });
         if parts.iter().all(|part| part.name != rung.id) {
-            parts.push(Part { name: rung.id, needs: if trains { Vec::new() } else { vec![0] } });
+            parts.push(part(rung.id, if trains { Vec::new() } else { vec![0] }));
         }
     }
     Ok(parts)
-}
-
-impl BenchAccuracy {
-    /// The same with its capture in a folder, where its path is relative.
-    pub(in crate::commands) fn within(mut self, folder: &Path) -> Self {
-        self.capture = folder.join(self.capture);
-        self
-    }
 }
 
 pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {

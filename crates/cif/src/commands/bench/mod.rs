@@ -143,8 +143,8 @@ pub(super) fn parts(words: &[String], folder: &std::path::Path) -> Result<Vec<ci
 
     let line = std::iter::once("cif bench").chain(words.iter().map(String::as_str));
     match Line::try_parse_from(line).map_err(Error::plain)?.what {
-        What::Accuracy(command) => accuracy::parts(&command.within(folder)),
-        What::Compare(command) => compare::parts(&command.within(folder)),
+        What::Accuracy(command) => accuracy::parts(command, folder),
+        What::Compare(command) => compare::parts(&command, folder),
         What::Step(_) | What::Export(_) | What::Hardness(_) => Err(Error::usage(
             format!("cif bench {} has no parts", words.first().map_or("", String::as_str)),
             "benches of a plan are accuracy and compare; others are a [[step]] with each = \"batch\"",

@@ -246,6 +246,9 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     interrupt::watch();
     let settings = quality.settings(&settings);
     let mut film = is_film.then(|| FilmFile::create(&command.output, per_second)).transpose()?;
+    if command.look == Look::Recorded {
+        note_mean_looks(&field, &views, time_of_all);
+    }
     let clock = SystemClock::start();
     let start = clock.now();
     for (index, Shot { view, camera }) in views.iter().enumerate() {
@@ -322,6 +325,21 @@ fn check_look(command: &Render, field: &Field) -> Result<(), Error> {
         ));
     }
     Ok(())
+}
+
+/// Notes how many views have the mean look although the recorded one is wanted.
+fn note_mean_looks(field: &Field, views: &[Shot], time_of_all: Option<f64>) {
+    let is_mean = |shot: &&Shot| {
+        let time = time_of_all.or(shot.view.time).unwrap_or(0.0);
+        field.record.drawing.exposure(&shot.camera, time).is_none()
+    };
+    let count = views.iter().filter(is_mean).count();
+    if count > 0 {
+        crate::messages::note!(
+            "{count} of {} views have the mean look: training saw no image of their camera, whose exposure is not known",
+            views.len()
+        );
+    }
 }
 
 /// Refuses films of several layers, and rates of what is no film.

@@ -129,8 +129,10 @@ fn part(
     maps: BTreeMap<String, PathBuf>,
     only: &str,
 ) -> Result<(), Error> {
-    let names = |capture: &Capture| parts_of(&capture.name, capture.config.seed, command.seeds, contenders);
-    let names: Vec<String> = captures.iter().flat_map(names).map(|part| part.name).collect();
+    let parts = |capture: &Capture| {
+        parts_of(Path::new(&capture.name), capture.config.seed, command.seeds, contenders)
+    };
+    let names: Vec<String> = captures.iter().flat_map(parts).map(|part| part.name).collect();
     if !names.iter().any(|name| name == only) {
         let help = format!("the parts are {}", names.join(", "));
         return Err(Error::usage(format!("--only {only}: there is no such part"), help));
@@ -148,24 +150,28 @@ fn part(
 }
 
 /// Parts of a capture that are jobs of their own: a reconstruction per seed, and what is trained on it.
-fn parts_of(capture: &str, seed: u64, seeds: u32, contenders: &[Contender]) -> Vec<Part> {
-    let mut parts = Vec::new();
+fn parts_of(capture: &Path, seed: u64, seeds: u32, contenders: &[Contender]) -> Vec<Part> {
+    let name = capture.file_name().unwrap_or_default().to_string_lossy();
+    let mut parts: Vec<Part> = Vec::new();
     for seed in (seed..).take(seeds as usize) {
         let base = parts.len();
-        parts.push(Part { name: runs::id(capture, seed, BASE), needs: Vec::new() });
-        let trained = contenders.iter().map(|contender| runs::id(capture, seed, contender.name()));
-        parts.extend(trained.map(|name| Part { name, needs: vec![base] }));
+        let part = |part: &str, needs: &[usize]| Part {
+            name: runs::id(&name, seed, part),
+            needs: needs.to_vec(),
+            capture: capture.to_owned(),
+        };
+        parts.push(part(BASE, &[]));
+        parts.extend(contenders.iter().map(|contender| part(contender.name(), &[base])));
     }
     parts
 }
 
-/// Parts of a comparison; captures are not read.
+/// Parts of a comparison of captures in a folder; they are not read.
 ///
 /// # Errors
 /// When a folder is no capture, or settings do not fit.
-pub(in crate::commands) fn parts(command: &BenchCompare) -> Result<Vec<Part>, Error> {
-    let file = command.queries.as_deref().map(questions::File::read).transpose()?;
-    if file.is_some() {
+pub(in crate::commands) fn parts(command: &BenchCompare, folder: &Path) -> Result<Vec<Part>, Error> {
+    if command.queries.is_some() {
         return Err(Error::usage(
             "questions are asked of all runs together, so that they are no parts of a plan",
             "leave --queries out of the plan, and run the same comparison with it when the batch is done",
@@ -173,12 +179,11 @@ pub(in crate::commands) fn parts(command: &BenchCompare) -> Result<Vec<Part>, Er
     }
     let contenders = contenders(command, false)?;
     let mut all: Vec<Part> = Vec::new();
-    for path in &command.captures {
-        let layout =
-            command.capture_options.layout_after(path, |layout| base_config(command, layout).map(drop))?;
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
+    for capture in &command.captures {
+        let check = |layout| base_config(command, layout).map(drop);
+        let layout = command.capture_options.layout_after(&folder.join(capture), check)?;
         let begin = all.len();
-        let of_capture = parts_of(&name, base_config(command, layout)?.seed, command.seeds, &contenders);
+        let of_capture = parts_of(capture, base_config(command, layout)?.seed, command.seeds, &contenders);
         all.extend(
             of_capture
                 .into_iter()

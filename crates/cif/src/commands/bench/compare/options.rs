@@ -125,14 +125,6 @@ fn iterations(text: &str) -> Result<Iterations, String> {
     }
 }
 
-impl BenchCompare {
-    /// The same with captures in a folder, where their paths are relative.
-    pub(in crate::commands) fn within(mut self, folder: &std::path::Path) -> Self {
-        self.captures.iter_mut().for_each(|capture| *capture = folder.join(&*capture));
-        self
-    }
-}
-
 impl Iterations {
     pub(super) fn of(self, head: HeadName) -> u32 {
         match self {
