@@ -110,11 +110,13 @@ mod tests {
 
     #[test]
     fn a_process_is_asked_to_stop_once() {
-        let script = "trap 'n=$((n+1)); echo $n; if [ $n -gt 1 ]; then exit 1; fi; asked=1' TERM; n=0; asked=; \
-                      while [ -z \"$asked\" ]; do sleep 0.01; done; sleep 0.3; exit 130";
-        let (status, _) =
-            run(Command::new("sh").args(["-c", script]).stdout(std::process::Stdio::null()), &|| true)
-                .unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let ready = folder.path().join("ready");
+        // It ends with 1 where it is asked twice.
+        let script = "n=0; trap 'n=$((n+1))' TERM; : > \"$0\"; while [ $n -eq 0 ]; do sleep 0.01; done; sleep 0.3; \
+                      [ $n -eq 1 ] && exit 130; exit 1";
+        let mut command = Command::new("sh");
+        let (status, _) = run(command.args(["-c", script]).arg(&ready), &|| ready.exists()).unwrap();
         assert_eq!(status.code(), Some(130));
     }
 }

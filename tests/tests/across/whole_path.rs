@@ -656,3 +656,13 @@ fn paths_of_moving_objects_are_drawn() {
     field.save(path.join("scene.cif")).unwrap();
     cif(path, "render scene.cif --camera views.json --what tracks -o none").fails(1, &["without masks"]);
 }
+
+#[test]
+fn a_plan_looks_for_points_as_training_does() {
+    let folder = with_capture(4);
+    let path = folder.path();
+    assert!(!cif(path, "plan table").succeeds().stderr.contains("no points"));
+    fs::remove_file(path.join("table/points.npy")).unwrap();
+    let plan = cif(path, "plan table").succeeds();
+    assert!(plan.stderr.contains("it has no points"), "{}", plan.stderr);
+}

@@ -127,6 +127,7 @@ fn a_rigid_object_moves_by_poses_of_its_own() {
 
 #[cfg(feature = "wgpu")]
 #[test]
+#[ignore = "long: make test-long"]
 fn a_rigid_object_moves_by_poses_of_its_own_on_a_gpu() {
     let Some(gpu) = cif_render::wgpu::testing::gpu() else { return };
     check_rigid_object([60, 160, 20], |trainer| trainer.use_gpu(&gpu).unwrap());

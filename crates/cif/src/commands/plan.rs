@@ -2,18 +2,20 @@
 
 use std::path::PathBuf;
 
-use cif_train::{EffectChoice, EffectPlan, TrainConfig};
+use cif_train::{EffectChoice, EffectPlan, Stop, TrainConfig};
 use clap::Args;
 
 use crate::commands::shared::named::preset;
 use crate::commands::shared::{CaptureOptions, print_warnings};
 use crate::error::Error;
 use crate::report::{JsonReport, OnlyReport};
+use crate::{interrupt, starting_points};
 
 /// Show which effects a capture needs, and their cost
 #[derive(Debug, Args)]
 #[command(after_help = "\
 `cif train` follows this plan (unless the preset is paper, or --effects says otherwise) and records it in the scene.
+Points of a capture that has none are triangulated first, as in training, which takes some seconds.
 Each line names the flag of `cif train` that overrides it; settings on the command line or in a
 --config file override the plan.
 
@@ -42,9 +44,13 @@ impl JsonReport for EffectPlan {
 pub(super) fn run(command: &Plan) -> Result<(), Error> {
     command.report.check([command.capture.as_path()])?;
     let preset = preset(&command.preset, "--preset")?;
-    let dataset = command.capture_options.open(&command.capture)?;
-    print_warnings(&dataset);
+    let mut dataset = command.capture_options.open(&command.capture)?;
     let config = TrainConfig::preset(preset, dataset.layout);
+    // As in training: what points show of the light of cameras is evidence.
+    if config.model.triangulate {
+        starting_points::find(&mut dataset, &Stop::when(interrupt::requested).into())?;
+    }
+    print_warnings(&dataset);
     let plan = EffectPlan::new(&dataset, &config, &command.effects).map_err(Error::plain)?;
     command.report.give(|| plan.clone(), || print(&plan))
 }
