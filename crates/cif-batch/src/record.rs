@@ -150,14 +150,15 @@ impl Kept {
     }
 }
 
+/// Beginning of the line of a log that shows the command.
+pub const COMMAND: &str = "$ ";
+
 /// Last line of a log that says anything: the error, where there is one.
 #[must_use]
 pub fn last_words(log: &Path) -> Option<String> {
     let text = String::from_utf8_lossy(&std::fs::read(log).ok()?).into_owned();
-    let error = text
-        .lines()
-        .rfind(|line| line.starts_with("Error"))
-        .or_else(|| text.lines().rfind(|line| !line.trim().is_empty()))?;
+    let says = |line: &&str| !line.trim().is_empty() && !line.starts_with(COMMAND);
+    let error = text.lines().rfind(|line| line.starts_with("Error")).or_else(|| text.lines().rfind(says))?;
     let line = error.trim_start_matches("Error:").trim().trim_start_matches(['×', 'x']).trim();
     Some(line.chars().take(300).collect())
 }
@@ -229,7 +230,8 @@ mod tests {
         let log = folder.path().join("log");
         for (text, found) in [
             ("step 1\nError:  × a.png: damaged\n  help: replace it\n", Some("a.png: damaged")),
-            ("killed\n\n", Some("killed")),
+            ("$ cif train a\nkilled\n\n", Some("killed")),
+            ("$ cif train a\n", None),
             ("\n", None),
         ] {
             std::fs::write(&log, text).unwrap();

@@ -241,6 +241,10 @@ fn benches_are_jobs_with_the_same_tables() {
 fn engines_get_a_task_for_every_job() {
     let folder = with_plan(&["a", "b"], &plan("[resources]\nthreads = 2\nmemory_gib = 1.5\ntime = \"2h\"\n"));
     let path = folder.path();
+    // A task has the threads that the plan gives it, whatever its machine has.
+    cif(path, "batch plan.toml --job train:0").succeeds();
+    let log = fs::read_to_string(path.join("results/jobs/train/a/run.log")).unwrap();
+    assert!(log.starts_with("$ cif train captures/a ") && log.contains(" --threads 2\n"), "{log}");
     for (engine, file) in [("openjd", "job.json"), ("slurm", "job.sh"), ("hyperqueue", "job.toml")] {
         let line = format!("batch plan.toml --for {engine} -o {file}");
         cif(path, &line).succeeds();

@@ -196,7 +196,8 @@ fn named(command: &BatchCommand, batch: &Batch) -> Result<(), Error> {
     let inputs = Inputs::new(batch);
     let mut failed = Vec::new();
     for index in jobs.into_iter().flatten() {
-        let job = Job { batch, index, threads: command.threads, wait: true };
+        let of_plan = batch.steps[batch.jobs[index].step].resources.threads;
+        let job = Job { batch, index, threads: command.threads.or(of_plan), wait: true };
         let id = &batch.jobs[index].id;
         match one::run(&job, &inputs)? {
             Outcome::Kept => crate::messages::outcome!("{id}: kept"),

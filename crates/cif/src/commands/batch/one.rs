@@ -1,14 +1,16 @@
 //! One job: locked, run as a process of its own, and recorded.
 
 use std::fs::{File, OpenOptions};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use cif_batch::Batch;
 use cif_batch::process;
-use cif_batch::record::{Kept, MadeFrom, Record, Spent, State, last_words};
+use cif_batch::record::{COMMAND, Kept, MadeFrom, Record, Spent, State, last_words};
 
 use super::inputs::Inputs;
+use crate::commands::shared::command_line;
 use crate::error::Error;
 use crate::lock::{Attempt, Lock};
 use crate::{interrupt, output, program};
@@ -130,15 +132,14 @@ fn start(job: &Job<'_>, goes_on: bool, log: &Path) -> Result<(std::process::Exit
     let opened: File =
         if goes_on { OpenOptions::new().append(true).create(true).open(log) } else { File::create(log) }
             .map_err(Error::io("write", log))?;
+    let mut words = of.words.clone();
+    words.extend(goes_on.then(|| "--resume-if-begun".to_owned()));
+    words.extend(job.threads.iter().flat_map(|threads| ["--threads".to_owned(), threads.to_string()]));
+    // As it can be run by hand, in the folder of the plan.
+    writeln!(&opened, "{COMMAND}{}", command_line(&words)).map_err(Error::io("write", log))?;
     let errors = opened.try_clone().map_err(Error::io("write", log))?;
     let mut command = program::command();
-    command.current_dir(&job.batch.folder).args(&of.words);
-    if goes_on {
-        command.arg("--resume-if-begun");
-    }
-    if let Some(threads) = job.threads {
-        command.args(["--threads", &threads.to_string()]);
-    }
+    command.current_dir(&job.batch.folder).args(&words);
     command.stdin(std::process::Stdio::null()).stdout(opened).stderr(errors);
     process::run(&mut command, &interrupt::requested)
         .map_err(Error::io("run", &PathBuf::from(command.get_program())))
