@@ -108,7 +108,7 @@ ARCHS ?=
 dist: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF) $(DIST_TOOLS)/.tools-$(CARGO_ABOUT)-$(CARGO_CYCLONEDX)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(ZIG)"
 	ARCHS="$(ARCHS)" PATH="$(abspath $(BIN)):$(abspath $(DIST_TOOLS)/bin):$$PATH" \
-		packaging/dist.sh $(DIST) $(DIST_SOURCE)
+		.ci/release/dist.sh $(DIST) $(DIST_SOURCE)
 
 demo: build
 	@mkdir -p $(OUT)

@@ -1,4 +1,4 @@
-//! What the command knows of its build: the commit that it was built from, and the example that `cif demo` puts into a
+//! Facts of its build that the command holds: the commit that it was built from, and the example that `cif demo` puts into a
 //! folder, a capture and a scene that was trained on it. None has to be there: a source archive has no commit, and may
 //! have no example.
 
@@ -86,7 +86,7 @@ fn sources(root: &Path) -> io::Result<Vec<String>> {
     Ok(found)
 }
 
-/// What git prints; `None` where there is no git, or it fails.
+/// Output of git; `None` where there is no git, or it fails.
 fn git(root: &Path, words: &[&str]) -> Option<String> {
     let output = Command::new("git").args(words).current_dir(root).stderr(Stdio::null()).output().ok()?;
     let text = String::from_utf8(output.stdout).ok()?;

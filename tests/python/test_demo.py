@@ -1,4 +1,4 @@
-"""What the wheel holds: `cif demo` with its example, and what `cif --version` shows of the build."""
+"""Contents of the wheel: `cif demo` with its example, and what `cif --version` shows of the build."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `make dist` made: each part is what it says, installs in an empty environment, and works there.
+"""Parts that `make dist` made: each is what it says, installs in an empty environment, and works there.
 
 `make test-dist` runs them, in any Python that has pytest. CIF_TEST_DIST names the folder of the parts; without
 it they are skipped. Pythons that are not installed, and machines without a wheel, are skipped by name.
@@ -24,6 +24,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+# How the parts are made.
+RELEASE = ROOT / ".ci" / "release"
 DIST = Path(os.environ.get("CIF_TEST_DIST", ""))
 pytestmark = pytest.mark.skipif(
     "CIF_TEST_DIST" not in os.environ, reason="CIF_TEST_DIST names no folder of make dist: see tests/README.md"
@@ -52,7 +54,7 @@ def only(pattern: str) -> Path:
 
 
 def works(*command: str) -> bool:
-    """Whether a program is there and ends well."""
+    """True where a program is there and ends well."""
     return (
         bool(shutil.which(command[0]))
         and not subprocess.run(command, capture_output=True, check=False).returncode
@@ -196,7 +198,7 @@ def test_only_permissive_licences_are_allowed(licence: str, allowed: bool, tmp_p
         package = f'[package]\nname = "{name}"\nversion = "1.0.0"\nlicense = "{licence}"\n'
         (tmp_path / name / "Cargo.toml").write_text(f"{package}[dependencies]\n{dependencies}\n")
     crates = ["--manifest-path", tmp_path / "above" / "Cargo.toml"]
-    files = ["-c", ROOT / "packaging" / "about.toml", "-o", tmp_path / "out", ROOT / "packaging" / "about.hbs"]
+    files = ["-c", RELEASE / "about.toml", "-o", tmp_path / "out", RELEASE / "about.hbs"]
     command = [tool, "about", "generate", *crates, "--fail", *files]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode == 0) == allowed, done.stderr
@@ -270,7 +272,7 @@ def container(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Comman
     wheel_of_this_machine()
     image = f"cif-test-dist:{request.param}"
     extras = [] if platform.machine() == "x86_64" else ["--build-arg", "EXTRAS=usd"]
-    run(program, "build", "-f", ROOT / "Containerfile", "--target", request.param, "-t", image, *extras, DIST)
+    run(program, "build", "-f", RELEASE / "Containerfile", "--target", request.param, "-t", image, *extras, DIST)
     data = tmp_path / "data"
     data.mkdir()
     # The user of the image writes here, who is not the one that runs the tests.

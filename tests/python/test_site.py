@@ -58,7 +58,7 @@ SUBSTITUTIONS = [
     (r"^cif export ", "cif export --force "),
     (r"--size \d+x\d+", "--size 64x48"),
 ]
-"""What is changed in commands of pages before they run: pattern, replacement."""
+"""Changes of commands of pages before they run: pattern, replacement."""
 
 NOT_RUN = {
     r"\bphone\.mp4\b|\bleft\.mp4\b": "there is no video",
@@ -217,7 +217,7 @@ GIVEN: dict[str, Callable[[Path], object]] = {
     "fox.ply": exported("fox.ply"),
     "plan.toml": plan,
 }
-"""What commands of pages find: the name there, and what makes it in a folder that has a trained table.cif."""
+"""Inputs of commands of pages: the name there, and what makes it in a folder that has a trained table.cif."""
 
 
 @pytest.fixture(scope="session")

@@ -20,7 +20,7 @@ pub struct Part {
     pub capture: PathBuf,
 }
 
-/// What takes benches apart.
+/// Takes benches apart into parts.
 pub trait Benches {
     /// Parts of a bench, each after those that it needs; `words` is its command from the name of the bench on.
     ///
@@ -204,7 +204,7 @@ fn runs(plan: &Plan, captures: &[Capture]) -> Vec<Run> {
     captures.iter().enumerate().flat_map(of_capture).collect()
 }
 
-/// What a job works on.
+/// The scene, capture or batch that a job works on.
 struct Subject<'a> {
     name: String,
     capture: Option<usize>,

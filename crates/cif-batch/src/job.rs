@@ -35,7 +35,7 @@ pub struct Step {
     pub jobs: Range<usize>,
     /// Steps whose jobs its own need.
     pub needs: Vec<usize>,
-    /// What a job takes of a machine.
+    /// Share of a machine that a job takes.
     pub resources: Resources,
 }
 

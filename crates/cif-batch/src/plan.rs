@@ -41,7 +41,7 @@ pub struct Plan {
     /// Benches, each taken apart into jobs.
     #[serde(default)]
     pub bench: Vec<Bench>,
-    /// What a job takes of a machine.
+    /// Share of a machine that a job takes.
     #[serde(default)]
     pub resources: Resources,
     /// Options of the engines of farms.
@@ -145,7 +145,7 @@ pub struct Export {
     pub options: Words,
 }
 
-/// What a step is done for each of.
+/// Subjects of a step, of which each has a job.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Each {
@@ -164,7 +164,7 @@ pub enum Each {
 pub struct OwnStep {
     /// Name.
     pub name: String,
-    /// What it is done for each of.
+    /// Subjects, of which each has a job.
     #[serde(default)]
     pub each: Each,
     /// Steps that come first; a step of every scene needs the training anyway.
@@ -175,7 +175,7 @@ pub struct OwnStep {
     /// Files and folders that it makes, with placeholders.
     #[serde(default)]
     pub makes: Vec<String>,
-    /// What its jobs take, where that differs.
+    /// Share of a machine that its jobs take, where that differs.
     #[serde(flatten)]
     pub resources: Resources,
 }
@@ -190,7 +190,7 @@ pub struct Bench {
     pub command: Words,
 }
 
-/// What a job takes of a machine.
+/// Share of a machine that a job takes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Resources {

@@ -1,4 +1,4 @@
-//! What is kept of a job that ran, and whether its results still hold.
+//! Records of jobs that ran, by which their results hold or do not.
 
 use std::path::Path;
 
@@ -34,14 +34,14 @@ pub struct Record {
     pub attempts: u32,
     /// When it was begun last, RFC 3339.
     pub begun: String,
-    /// What it took; of a job that was interrupted, all its attempts together.
+    /// Resources that it took; of a job that was interrupted, all its attempts together.
     pub spent: Spent,
     /// Last line of its log, where it failed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub error: Option<String>,
 }
 
-/// What a job was made from.
+/// Inputs that a job was made from.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MadeFrom {
     /// Version of cif.
@@ -55,7 +55,7 @@ pub struct MadeFrom {
 }
 
 impl MadeFrom {
-    /// What differs, as a clause; `None` where nothing does.
+    /// The difference, as a clause; `None` where nothing does.
     #[must_use]
     pub fn difference(&self, now: &Self) -> Option<&'static str> {
         if self.version != now.version {
@@ -72,7 +72,7 @@ impl MadeFrom {
     }
 }
 
-/// What a job took of a machine. Where the system does not say, a value is 0.
+/// Resources that a job took. Where the system does not say, a value is 0.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Spent {
     /// Time that passed, seconds.
@@ -134,7 +134,7 @@ impl Record {
 }
 
 impl Kept {
-    /// What is kept of a job that would be made from `now`.
+    /// Results of a job that would be made from `now`.
     #[must_use]
     pub fn of(batch: &Batch, job: &Job, now: &MadeFrom) -> Self {
         let Some(record) = Record::read(batch, job) else { return Self::Missing };

@@ -23,7 +23,7 @@ pub enum Standing {
     LeftOut,
 }
 
-/// What a machine has.
+/// Resources of a machine.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {
     /// Jobs at once.

@@ -10,7 +10,7 @@ use crate::job::Batch;
 use crate::record::Spent;
 use crate::schedule::{Limits, Schedule};
 
-/// What the workers share.
+/// Workers, and the folder that they share.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Farm {
     /// Workers, each one job at a time.
@@ -32,7 +32,7 @@ pub struct Forecast {
     pub bytes: f64,
 }
 
-/// What jobs of a step take: work on a processor in seconds, and bytes through the folder.
+/// Cost of a job of a step: work on a processor in seconds, and bytes through the folder.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Cost {
     work_s: f64,

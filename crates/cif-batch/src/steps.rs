@@ -22,7 +22,7 @@ pub(crate) struct Template {
     pub(crate) needs: Vec<String>,
     /// The command, with placeholders.
     pub(crate) words: Vec<String>,
-    /// What it makes, with placeholders.
+    /// Files and folders that it makes, with placeholders.
     pub(crate) makes: Vec<String>,
     pub(crate) resources: Resources,
     pub(crate) goes_on: bool,

@@ -55,7 +55,7 @@ pub struct Undone {
     pub log: PathBuf,
 }
 
-/// What a page is about.
+/// Subject of a page.
 #[derive(Clone, Debug)]
 pub struct Batch<'a> {
     /// Name.

@@ -16,14 +16,14 @@ pub(crate) struct Header<'a> {
     pub(crate) title: &'a str,
     pub(crate) heading: &'a str,
     pub(crate) description: &'a str,
-    /// What it was measured with; see [`measured_on`].
+    /// Sentence on the measurement; see [`measured_on`].
     pub(crate) how: String,
     pub(crate) command: &'a str,
     /// The missing part and how to get it; `None` on a whole page.
     pub(crate) missing: Option<String>,
 }
 
-/// What numbers of one process were measured with.
+/// Sentence on the threads and instructions that one process measured with.
 pub(crate) fn measured_on(threads: usize, simd: &str) -> String {
     match threads {
         1 => format!("Measured on one thread with {simd}."),

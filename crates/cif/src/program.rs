@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::Command;
 use std::sync::OnceLock;
 
-/// What the command is part of.
+/// Program that the command is part of.
 #[derive(Debug)]
 enum Program {
     /// The command itself.

@@ -1,4 +1,4 @@
-//! What `cif --version` says of the build and of the machine.
+//! The text of `cif --version`: the build and the machine.
 
 use std::fmt::Write as _;
 use std::sync::OnceLock;

@@ -193,8 +193,8 @@ fn the_scene_of_the_example_is_finished_and_scores_as_stated() {
     // What it records about its run is text before the numbers; no path of a machine is in it.
     let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
     let header = std::str::from_utf8(&bytes[8..8 + length]).unwrap();
-    for path in ["/home/", "/root/", "/tmp/", "/work/", "/Users/", ":\\\\"] {
-        assert!(!header.contains(path), "{path}");
+    for part_of_path in ["/", ":\\\\"] {
+        assert!(!header.contains(part_of_path), "{header}");
     }
 
     let folder = tempfile::tempdir().unwrap();

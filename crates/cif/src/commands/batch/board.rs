@@ -39,7 +39,7 @@ pub(super) fn duration(seconds: f64) -> String {
     humantime::format_duration(Duration::from_secs(seconds.min(1e12) as u64)).to_string()
 }
 
-/// What a job took, in a few words.
+/// Resources that a job took, in a few words.
 pub(super) fn shown(spent: &Spent) -> String {
     let mut text = duration(spent.wall_s);
     if spent.cpu_s > 0.0 {

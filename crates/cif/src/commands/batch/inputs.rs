@@ -1,4 +1,4 @@
-//! What the jobs of a batch are made from, captures by their content.
+//! Inputs of the jobs of a batch, captures by their content.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -31,7 +31,7 @@ impl<'a> Inputs<'a> {
         Self { batch, captures: Mutex::default() }
     }
 
-    /// What a job would be made from now.
+    /// Inputs that a job would be made from now.
     ///
     /// # Errors
     /// With the id of a job that it needs and that is not done.

@@ -166,7 +166,7 @@ pub(super) fn run(command: &BatchCommand) -> Result<(), Error> {
     }
 }
 
-/// What this machine has for jobs.
+/// Resources of this machine for jobs.
 fn limits(command: &BatchCommand) -> Limits {
     let threads =
         command.threads.unwrap_or_else(|| available_parallelism().map_or(1, NonZeroUsize::get) as u32);

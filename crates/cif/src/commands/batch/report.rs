@@ -23,7 +23,7 @@ pub(super) struct JobState {
     pub(super) id: String,
     /// `to do`, `waits` for others, `begun`, `done`, or `failed` and `to do again` with the reason.
     pub(super) state: String,
-    /// What it took; 0 for what is not known.
+    /// Resources that it took; 0 for what is not known.
     pub(super) spent: Spent,
     /// Number of jobs that it needs.
     needs: usize,

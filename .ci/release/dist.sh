@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Everything that is published of the last commit, into a folder. `make dist` starts it with its tools on the PATH.
 set -euo pipefail
-root=$(cd "$(dirname "$0")/.." && pwd)
+root=$(cd "$(dirname "$0")/../.." && pwd)
 out=$1 source=$2
 mkdir -p "$(dirname "$out")" "$(dirname "$source")"
 out=$(realpath -m "$out") source=$(realpath -m "$source")
@@ -51,9 +51,9 @@ python plugin/blender/build.py "$out"
 # files into the wheel whose names begin with LICENSE.
 zig=$(python -c 'import pathlib, ziglang; print(pathlib.Path(ziglang.__file__).parent)')
 crates=(--manifest-path crates/cif-python/Cargo.toml --features extension-module)
-cargo about generate "${crates[@]}" --locked --fail -c packaging/about.toml -o LICENSE-crates.txt packaging/about.hbs
+cargo about generate "${crates[@]}" --locked --fail -c .ci/release/about.toml -o LICENSE-crates.txt .ci/release/about.hbs
 cargo metadata --format-version 1 --locked --filter-platform x86_64-unknown-linux-gnu \
-    | python packaging/notices.py >>LICENSE-crates.txt
+    | python .ci/release/notices.py >>LICENSE-crates.txt
 cp "$notices" LICENSE-rust.html
 {
     echo "Zig's own functions, and the library that it links in to unwind the stack"
@@ -67,7 +67,7 @@ for arch in "${archs[@]}"; do
     target=$arch-unknown-linux-gnu
     cargo cyclonedx "${crates[@]}" --target "$target" --format json --spec-version 1.5 --override-filename raw
     sbom=$out/cif4d-$version-$arch.cdx.json
-    python packaging/sbom.py crates/cif-python/raw.json "$sbom" "$(rustc --version)" "$(python -m ziglang version)"
+    python .ci/release/sbom.py crates/cif-python/raw.json "$sbom" "$(rustc --version)" "$(python -m ziglang version)"
     maturin build --release --zig --target "$target" --compatibility manylinux_2_28 --sbom-include "$sbom" --out "$out"
 done
 
