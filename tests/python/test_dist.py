@@ -272,7 +272,9 @@ def container(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Comman
     wheel_of_this_machine()
     image = f"cif-test-dist:{request.param}"
     extras = [] if platform.machine() == "x86_64" else ["--build-arg", "EXTRAS=usd"]
-    run(program, "build", "-f", RELEASE / "Containerfile", "--target", request.param, "-t", image, *extras, DIST)
+    run(
+        program, "build", "-f", RELEASE / "Containerfile", "--target", request.param, "-t", image, *extras, DIST
+    )
     data = tmp_path / "data"
     data.mkdir()
     # The user of the image writes here, who is not the one that runs the tests.
