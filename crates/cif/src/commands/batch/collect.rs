@@ -1,5 +1,6 @@
 //! The page over all scenes of a batch.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use cif_batch::record::{Record, State};
@@ -21,7 +22,18 @@ const PAGES: [&str; 2] = ["compare.html", "report.html"];
 pub(super) fn collect(plan: &Batch) -> Result<(), Error> {
     let folder = plan.place(&plan.output);
     std::fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
-    let scenes: Vec<Scene> = of_step(plan, TRAIN).filter_map(|job| scene(plan, job)).collect();
+    let mut of_scenes: BTreeMap<&str, Vec<&Job>> = BTreeMap::new();
+    for job in &plan.jobs {
+        if let Some((_, name)) = job.id.split_once('/') {
+            of_scenes.entry(name).or_default().push(job);
+        }
+    }
+    let of_training = |job: &Job| {
+        let name = job.id.split_once('/')?.1;
+        scene(plan, name, of_scenes.get(name)?)
+    };
+    let trainings = plan.jobs.iter().filter(|job| plan.steps[job.step].name == TRAIN);
+    let scenes: Vec<Scene> = trainings.filter_map(of_training).collect();
     let others = plan.jobs.iter().filter(|job| job.id != COLLECT);
     let undone: Vec<Undone> = others.filter_map(|job| undone(plan, job)).collect();
     let name = plan.plan.file_name().unwrap_or_default().to_string_lossy();
@@ -38,28 +50,23 @@ pub(super) fn collect(plan: &Batch) -> Result<(), Error> {
     Ok(())
 }
 
-fn of_step<'a>(plan: &'a Batch, name: &'a str) -> impl Iterator<Item = &'a Job> {
-    plan.jobs.iter().filter(move |job| plan.steps[job.step].name == name)
-}
-
 /// A path of the plan as the page has it.
 fn beside_page(plan: &Batch, path: &Path) -> PathBuf {
     path.strip_prefix(&plan.output).unwrap_or(path).to_owned()
 }
 
-/// The scene that a training has made; `None` where it was not begun.
-fn scene(plan: &Batch, job: &Job) -> Option<Scene> {
-    Record::read(plan, job)?;
-    let name = job.id.split_once('/')?.1;
+/// A scene, of the jobs that work on it; `None` where none was begun.
+fn scene(plan: &Batch, name: &str, own: &[&Job]) -> Option<Scene> {
+    let records: Vec<Record> = own.iter().filter_map(|job| Record::read(plan, job)).collect();
+    if records.is_empty() {
+        return None;
+    }
     let (capture, settings) = name.split_once('/')?;
     let folder = plan.output.join("scenes").join(name);
     let json = |file: &str| -> Value {
         let text = std::fs::read_to_string(plan.place(&folder.join(file))).unwrap_or_default();
         serde_json::from_str(&text).unwrap_or_default()
     };
-    let own: Vec<&Job> =
-        plan.jobs.iter().filter(|job| job.id.split_once('/').is_some_and(|(_, of)| of == name)).collect();
-    let records: Vec<Record> = own.iter().filter_map(|job| Record::read(plan, job)).collect();
     let is_shown = |path: &&PathBuf| {
         plan.place(path).is_file() && path.extension().is_none_or(|ending| ending != "json")
     };
