@@ -45,7 +45,7 @@ BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13 b
 # One interpreter for every build, or PyO3 is built again.
 export PYO3_PYTHON := $(abspath $(BIN)/python)
 
-.PHONY: help build wheel dist demo plugin stubs docs site test test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-simready test-batch test-page test-blender test-capture test-dist fuzz lint lint-format lint-page format clean
+.PHONY: help build wheel dist demo plugin stubs docs site test test-build test-wheel test-rust test-long test-python test-mujoco test-newton test-validator test-simready test-batch test-page test-blender test-capture test-dist fuzz lint lint-format lint-page format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
@@ -136,6 +136,15 @@ plugin:
 export CIF_TEST_ONNX ?= require
 test: test-rust test-python
 
+# `make test` builds the tests before the wheel, for which little is left then: both processors have work to the end, as
+# libraries are built beside the tests of others.
+TEST_FEATURES := --features cif-usd/python,cif-vision/onnx
+test-build: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
+	cargo test --locked --no-run $(TEST_FEATURES)
+ifneq ($(filter test,$(MAKECMDGOALS)),)
+test-wheel: test-build
+endif
+
 # In the profile and with the features of the Rust tests, so that both share their libraries: CONTRIBUTING tells more.
 test-wheel: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	@rm -rf $(TEST_WHEELS)
@@ -155,7 +164,7 @@ docs: export CIF_WRITE_DOCS := 1
 test-rust test-long docs: test-wheel
 	PYTHONPATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))') \
 	LD_LIBRARY_PATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_config_var("LIBDIR"))') \
-	cargo test --locked --no-fail-fast --features cif-usd/python,cif-vision/onnx $(SELECTION)
+	cargo test --locked --no-fail-fast $(TEST_FEATURES) $(SELECTION)
 
 test-python: test-wheel
 	$(TEST_BIN)/python -m pytest

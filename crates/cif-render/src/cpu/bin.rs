@@ -111,48 +111,60 @@ pub(super) fn sort_by_depth(splats: &mut Vec<Splat>) {
 /// Most (tile, splat) pairs of a view: positions are 32-bit.
 const MAX_PAIRS: u64 = u32::MAX as u64;
 
-/// Smallest sigma of a splat over a tile's pixel centres' bounding rectangle.
-fn smallest_sigma(splat: &Splat, low: [f32; 2], high: [f32; 2]) -> f32 {
-    let [l00, l01, l11] = splat.factor;
-    // Rectangle relative to the mean.
-    let (x_low, x_high) = (low[0] - splat.mean[0], high[0] - splat.mean[0]);
-    let (y_low, y_high) = (low[1] - splat.mean[1], high[1] - splat.mean[1]);
-    let inside_x = x_low <= 0.0 && x_high >= 0.0;
-    let inside_y = y_low <= 0.0 && y_high >= 0.0;
-    if inside_x && inside_y {
-        return 0.0;
+/// The conic of a splat, with what finds its smallest value on the edges of rectangles.
+#[derive(Clone, Copy)]
+struct Conic {
+    factor: [f32; 3],
+    /// Of the best point on a vertical line: y / x; on a horizontal one: x / y.
+    slopes: [f32; 2],
+}
+
+impl Conic {
+    fn new(factor: [f32; 3]) -> Self {
+        let [l00, l01, l11] = factor;
+        Self { factor, slopes: [-l00 * l01 / (l01 * l01 + l11 * l11), -l01 / l00] }
     }
-    let mut smallest = f32::INFINITY;
-    if !inside_x {
-        let x = if x_low > 0.0 { x_low } else { x_high };
-        let y = (-l00 * l01 * x / (l01 * l01 + l11 * l11)).clamp(y_low, y_high);
-        smallest = smallest.min(splat.sigma(x, y));
+
+    /// Twice the smallest sigma over a rectangle relative to the centre.
+    #[inline(always)]
+    fn smallest_over(&self, [x_low, y_low]: [f32; 2], [x_high, y_high]: [f32; 2]) -> f32 {
+        let [l00, l01, l11] = self.factor;
+        let twice_sigma = |x: f32, y: f32| {
+            let (u0, u1) = (l00 * x + l01 * y, l11 * y);
+            u0 * u0 + u1 * u1
+        };
+        // The nearest to the centre of each axis; it lies inside along one that is 0.
+        let (x, y) = (0.0_f32.max(x_low).min(x_high), 0.0_f32.max(y_low).min(y_high));
+        let beside = twice_sigma(x, (self.slopes[0] * x).max(y_low).min(y_high));
+        let above = twice_sigma((self.slopes[1] * y).max(x_low).min(x_high), y);
+        // Where both are 0, so is each; an axis along which the centre is inside has no edge that is nearer.
+        match (x == 0.0, y == 0.0) {
+            (true, _) => above,
+            (_, true) => beside,
+            _ => beside.min(above),
+        }
     }
-    if !inside_y {
-        let y = if y_low > 0.0 { y_low } else { y_high };
-        let x = (-l01 * y / l00).clamp(x_low, x_high);
-        smallest = smallest.min(splat.sigma(x, y));
-    }
-    smallest
 }
 
 /// Calls `visit` with every tile of the region that the splat reaches, in row order, and
 /// the passes that reach it, a bit each.
+#[inline(always)]
 fn visit_tiles(splat: &Splat, region: &TileRegion, mut visit: impl FnMut(u32, u8)) {
     let tile = TILE as f32;
     let [columns, rows] = region.reached(splat);
+    let conic = Conic::new(splat.factor);
     // A hair more than the gate, so that rounding never drops a tile that holds a drawn pixel.
-    let reaches = splat.reach.map(|reach| reach * 1.000_01 + 1e-5);
+    let reaches = splat.reach.map(|reach| 2.0 * (reach * 1.000_01 + 1e-5));
     for row in rows {
+        // Pixel centres lie half a pixel inside the tile.
+        let y = row as f32 * tile + 0.5 - splat.mean[1];
+        let first = (row - region.first_row) * region.columns;
         for column in columns.clone() {
-            let tile_index = (row - region.first_row) * region.columns + (column - region.first_column);
-            // Pixel centres lie half a pixel inside the tile.
-            let low = [column as f32 * tile + 0.5, row as f32 * tile + 0.5];
-            let high = [low[0] + tile - 1.0, low[1] + tile - 1.0];
-            let sigma = smallest_sigma(splat, low, high);
-            let passes = u8::from(sigma <= reaches[0]) | u8::from(sigma <= reaches[1]) << 1;
+            let x = column as f32 * tile + 0.5 - splat.mean[0];
+            let smallest = conic.smallest_over([x, y], [x + (tile - 1.0), y + (tile - 1.0)]);
+            let passes = u8::from(smallest <= reaches[0]) | u8::from(smallest <= reaches[1]) << 1;
             if passes != 0 {
-                visit(tile_index, passes);
+                visit(first + column - region.first_column, passes);
             }
         }
     }
@@ -246,6 +258,11 @@ impl TileLists {
                 rank += 1;
             }
         }
+    }
+
+    /// True when every splat knows its pairs, as gradients ask for.
+    pub(super) fn is_by_splat(&self) -> bool {
+        !self.splat_offsets.is_empty()
     }
 
     /// Number of tiles.

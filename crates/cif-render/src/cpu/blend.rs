@@ -10,13 +10,14 @@ use super::tile::{BlendingRule, Groups, SplatInTile, TilePixels, TilePlace, live
 use crate::{BlendRequest, Blending};
 
 /// The splats that one blending still draws somewhere in a tile, front to back.
+#[repr(C, align(64))]
 pub(super) struct DrawnSplats<'a> {
+    /// Transmittance of every pixel so far, as [`BlendingRule::step`] keeps it.
+    pub(super) transmittance: TilePixels,
     splats: &'a [Splat],
     entries: std::iter::Enumerate<std::slice::Iter<'a, TileEntry>>,
     place: &'a TilePlace,
     blending: Blending,
-    /// Transmittance of every pixel so far, as [`BlendingRule::step`] keeps it.
-    pub(super) transmittance: TilePixels,
     /// Groups that still let light through.
     pub(super) alive: Groups,
 }

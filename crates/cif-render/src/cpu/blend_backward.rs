@@ -10,7 +10,8 @@ use fearless_simd_macros::simd;
 use super::bin::TileEntry;
 use super::blend::DrawnSplats;
 use super::pixels::{LANES, Lanes, load, splat, sum_each};
-use super::project::{Splat, SplatGradient};
+use super::project::Splat;
+use super::project_backward::SplatGradient;
 use super::rasterize_backward::Sums;
 use super::tile::{BlendingRule, GROUPS, TilePixels, TilePlace};
 use crate::{BlendRequest, Blending, GeometryPath};
@@ -19,12 +20,13 @@ use crate::{BlendRequest, Blending, GeometryPath};
 const TOGETHER: usize = 4;
 
 /// Gradients by the blended values of the pixels of a tile.
+#[repr(C, align(64))]
 pub(super) struct BlendCotangents {
+    /// `v_B . B` and what is left of it behind the splats so far; 0 where nothing goes through the weights.
+    remainder: TilePixels,
     /// dL/dblended, `[GROUPS, padded]`: C channels and zeros up to a multiple of [`TOGETHER`].
     v_blended: Vec<Lanes>,
     padded: usize,
-    /// `v_B . B` and what is left of it behind the splats so far; 0 where nothing goes through the weights.
-    remainder: TilePixels,
 }
 
 impl BlendCotangents {

@@ -8,7 +8,7 @@ use super::bin::TileEntry;
 use super::labels::IdentityRows;
 use super::pixels::{LANES, load, splat};
 use super::project::Splat;
-use super::tile::{BlendingRule, GROUPS, SplatInTile, TilePixels, TilePlace, live, prepare};
+use super::tile::{Aligned, BlendingRule, GROUPS, SplatInTile, TilePixels, TilePlace, live, prepare};
 
 /// Instance outputs of a tile.
 #[derive(Clone, Debug)]
@@ -62,13 +62,13 @@ pub(super) fn instance_tile<S: Simd>(
     labels.sort_unstable();
     labels.dedup();
     tile.foreground = [[0.0; LANES]; GROUPS];
-    let mut masses: Vec<TilePixels> = vec![[[0.0; LANES]; GROUPS]; labels.len()];
+    let mut masses = vec![Aligned([[0.0; LANES]; GROUPS]); labels.len()];
 
     let blending = BlendingRule::new(simd);
-    let mut color_transmittance = place.initial_transmittance();
+    let mut color_transmittance = Aligned(place.initial_transmittance());
     let mut instance_transmittance = color_transmittance;
     let mut slots: Vec<(usize, f32)> = Vec::new();
-    let mut live_color = live(&color_transmittance);
+    let mut live_color = live(&color_transmittance.0);
     let mut live_instances = live_color;
     for entry in entries {
         if live_color.union(live_instances).is_empty() {
@@ -86,7 +86,7 @@ pub(super) fn instance_tile<S: Simd>(
         let share = splat(simd, labelled_shares[s.gaussian as usize]);
         for group in in_color {
             let at = prepared.footprint(simd, group);
-            let blended = blending.step(simd, opacity * at.peak, &mut color_transmittance[group]);
+            let blended = blending.step(simd, opacity * at.peak, &mut color_transmittance.0[group]);
             let foreground = &mut tile.foreground[group];
             blended.weight.mul_add(share, load(simd, foreground)).store_array(foreground);
             live_color.finish(group, blended.finished);
@@ -101,10 +101,10 @@ pub(super) fn instance_tile<S: Simd>(
         }
         for group in in_instances {
             let at = prepared.footprint(simd, group);
-            let transmittance = &mut instance_transmittance[group];
+            let transmittance = &mut instance_transmittance.0[group];
             let blended = blending.step(simd, occupancy * at.peak, transmittance);
             for (slot, probability) in &slots {
-                let mass = &mut masses[*slot][group];
+                let mass = &mut masses[*slot].0[group];
                 blended.weight.mul_add(splat(simd, *probability), load(simd, mass)).store_array(mass);
             }
             live_instances.finish(group, blended.finished);
@@ -115,7 +115,7 @@ pub(super) fn instance_tile<S: Simd>(
     for group in 0..GROUPS {
         for lane in 0..LANES {
             let (mut best, mut most, mut total) = (0_u16, 0.0_f32, 0.0_f32);
-            for (label, mass) in labels.iter().zip(&masses) {
+            for (label, Aligned(mass)) in labels.iter().zip(&masses) {
                 let mass = mass[group][lane];
                 total += mass;
                 if mass > most {
@@ -124,7 +124,7 @@ pub(super) fn instance_tile<S: Simd>(
             }
             let mut entropy = 0.0;
             if total > 0.0 {
-                for mass in &masses {
+                for Aligned(mass) in &masses {
                     let share = mass[group][lane] / total;
                     if share > 0.0 {
                         entropy -= share * share.ln();
@@ -137,7 +137,7 @@ pub(super) fn instance_tile<S: Simd>(
                     labels
                         .iter()
                         .zip(&masses)
-                        .map(|(label, mass)| (label + 1, mass[group][lane]))
+                        .map(|(label, Aligned(mass))| (label + 1, mass[group][lane]))
                         .filter(|(_, mass)| *mass > 0.0),
                 );
                 // Stable, so that ties go to the lowest index.

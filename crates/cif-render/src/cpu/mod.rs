@@ -3,7 +3,9 @@
 //! | module | stage |
 //! |---|---|
 //! | `deform` | canonical Gaussians to the time of the view, and back |
-//! | `project` | Gaussians to splats, and back |
+//! | `posed` | the Gaussians at the time of the view, by row |
+//! | `project`, `project_backward` | Gaussians to splats, and back |
+//! | `vectors`, `functions`, `rotation`, `harmonics` | what they compute with, sixteen Gaussians at a time |
 //! | `bin` | depth order and tile lists |
 //! | `bands` | which tiles are drawn at once |
 //! | `tile` | how a splat falls on a tile's pixels and blends: the steps that all of these share: |
@@ -27,20 +29,26 @@ mod contributors;
 mod counts;
 mod deform;
 mod dense;
+mod functions;
 mod groups;
+mod harmonics;
 mod identity;
 mod labels;
 mod level;
 mod matrix;
 mod pixels;
+mod posed;
 mod products;
 mod project;
+mod project_backward;
 mod rasterize;
 mod rasterize_backward;
 mod renderer;
+mod rotation;
 mod tile;
 mod timing;
 mod vector;
+mod vectors;
 
 pub use contributors::{ContributorMass, ContributorRule};
 pub use counts::IdentityCounts;

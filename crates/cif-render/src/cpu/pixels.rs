@@ -52,26 +52,6 @@ pub(super) fn sum_each<S: Simd>(simd: S, vectors: [f32x16<S>; 4]) -> [f32; 4] {
     [a, b, c, d]
 }
 
-/// `ln(2)^k / k!` for k = 6 down to 0.
-const EXP2_COEFFICIENTS: [f32; 7] =
-    [1.540_353e-4, 1.333_355_8e-3, 9.618_129e-3, 5.550_411e-2, 2.402_265e-1, std::f32::consts::LN_2, 1.0];
-
-/// `2^-x` for x in [0, 126]; relative error below 2e-7. Source: Taylor polynomial of degree 6 on
-/// [-1/2, 1/2], scaled by the exponent bits.
-#[inline(always)]
-pub(super) fn exp2_negative<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
-    let x = x.min(splat(simd, 126.0));
-    let whole = x.round_ties_even();
-    let f = whole - x;
-    let mut p = splat(simd, EXP2_COEFFICIENTS[0]);
-    for coefficient in &EXP2_COEFFICIENTS[1..] {
-        p = p.mul_add(f, splat(simd, *coefficient));
-    }
-    let exponent: fearless_simd::i32x16<S> = whole.to_int();
-    let scale: f32x16<S> = ((127 - exponent) << 23).bitcast();
-    p * scale
-}
-
 #[cfg(test)]
 mod tests {
     use fearless_simd::{Level, dispatch};
@@ -81,28 +61,6 @@ mod tests {
 
     fn levels() -> Vec<Level> {
         SimdLevel::available().into_iter().filter_map(SimdLevel::level).collect()
-    }
-
-    #[test]
-    fn exp2_is_accurate_on_every_level() {
-        for level in levels() {
-            let mut worst = 0.0_f64;
-            for k in 0..20_000 {
-                let x = 8.0 * (k as f32) / 20_000.0;
-                let got = dispatch!(level, simd => exp2_negative(simd, splat(simd, x)).to_array())[3];
-                let expected = f64::from(-x).exp2();
-                worst = worst.max((f64::from(got) / expected - 1.0).abs());
-            }
-            assert!(worst < 2.5e-7, "{level:?}: {worst}");
-        }
-    }
-
-    #[test]
-    fn exp2_underflows_quietly() {
-        for level in levels() {
-            let got = dispatch!(level, simd => exp2_negative(simd, splat(simd, 1e30)).to_array());
-            assert!(got.iter().all(|v| *v >= 0.0 && *v < 1e-37));
-        }
     }
 
     #[test]

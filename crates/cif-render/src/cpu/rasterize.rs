@@ -10,11 +10,12 @@ use super::labels::{IdentityRows, TileLabels};
 use super::pixels::{LANES, load, splat, splat_each};
 use super::project::Splat;
 use super::tile::{
-    BlendingRule, Footprint, GROUPS, Groups, SplatInTile, TilePixels, TilePlace, live, prepare,
+    BlendingRule, Footprint, GROUPS, Groups, MetGroups, SplatInTile, TilePixels, TilePlace, live, prepare,
 };
 
 /// Blended values of a tile.
 #[derive(Clone, Debug)]
+#[repr(C, align(64))]
 pub(super) struct TileImage {
     pub(super) color: [TilePixels; 3],
     /// Weighted depth D.
@@ -27,6 +28,8 @@ pub(super) struct TileImage {
     pub(super) instance_transmittance: TilePixels,
     /// Of each group, one past the last entry that supports a label of it.
     pub(super) supported: [u32; GROUPS],
+    /// Where each entry was met, up to the last that was; kept for gradients alone.
+    pub(super) met: Vec<MetGroups>,
     /// Evaluated (pixel, splat) pairs.
     pub(super) evaluated: u64,
     /// Those of them evaluated for identities.
@@ -43,6 +46,7 @@ impl Default for TileImage {
             label_probability: zero,
             instance_transmittance: zero,
             supported: [0; GROUPS],
+            met: Vec::new(),
             evaluated: 0,
             evaluated_instances: 0,
         }
@@ -115,7 +119,7 @@ impl<S: Simd> Painted<'_, S> {
     }
 }
 
-/// Blends a tile. `labels` are read when `INSTANCES`.
+/// Blends a tile. `labels` are read when `INSTANCES`; where entries were met is kept when `keeps_met`.
 #[simd]
 pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
     simd: S,
@@ -123,6 +127,7 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
     entries: &[TileEntry],
     place: &TilePlace,
     labels: Option<(&TileLabels, IdentityRows<'_>)>,
+    keeps_met: bool,
     image: &mut TileImage,
 ) {
     image.color = [[[0.0; LANES]; GROUPS]; 3];
@@ -131,6 +136,7 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
     }
     image.transmittance = place.initial_transmittance();
     (image.evaluated, image.evaluated_instances) = (0, 0);
+    image.met.clear();
     let blending = BlendingRule::new(simd);
     let mut probabilities = Vec::new();
     let mut live_color = live(&image.transmittance);
@@ -155,6 +161,10 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
         let Some(prepared) = prepare(simd, s, place, wanted) else { continue };
         let prepared: SplatInTile<S> = prepared;
         let [in_color, in_instances] = prepared.groups;
+        if keeps_met {
+            image.met.resize(pair, MetGroups::default());
+            image.met.push(MetGroups::new(prepared.groups));
+        }
         image.evaluated += in_color.union(in_instances).pixels();
         if INSTANCES {
             image.evaluated_instances += in_instances.pixels();

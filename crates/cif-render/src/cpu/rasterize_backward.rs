@@ -16,9 +16,10 @@ use fearless_simd_macros::simd;
 use super::bin::TileEntry;
 use super::labels::{IdentityRows, TileLabels};
 use super::pixels::{LANES, Lanes, load, splat, splat_each, sum, sum_each};
-use super::project::{Splat, SplatGradient};
+use super::project::Splat;
+use super::project_backward::SplatGradient;
 use super::tile::{
-    BlendingRule, Footprint, GROUPS, Groups, SplatInTile, TilePixels, TilePlace, live, prepare,
+    Aligned, BlendingRule, Footprint, GROUPS, Groups, MetGroups, SplatInTile, TilePixels, TilePlace, live,
 };
 use crate::GeometryPath;
 
@@ -26,24 +27,26 @@ use crate::GeometryPath;
 const FROM_BINARY: f32 = 2.0 * std::f32::consts::LN_2;
 
 /// Cotangents of a tile's colours: gradients of the colour loss by them.
+#[repr(C, align(64))]
 pub(super) struct TileCotangents {
     /// dL/dcolour.
     pub(super) color: [TilePixels; 3],
-    /// dL/dalpha, where there is one.
-    pub(super) alpha: Option<Box<TilePixels>>,
     /// `v_C . C_out`, background included, and `v_A A`.
     pub(super) remainder: TilePixels,
+    /// dL/dalpha, where there is one.
+    pub(super) alpha: Option<Box<TilePixels>>,
 }
 
 /// Instance inputs of a tile.
+#[repr(C, align(64))]
 pub(super) struct TileInstances<'a> {
+    /// 1 / M_y of each pixel, 0 where nothing flows.
+    pub(super) inverse_probability: TilePixels,
     pub(super) labels: &'a TileLabels,
     pub(super) rows: IdentityRows<'a>,
     pub(super) geometry: GeometryPath,
     /// Loss weight of a pixel.
     pub(super) weight: f32,
-    /// 1 / M_y of each pixel, 0 where nothing flows.
-    pub(super) inverse_probability: TilePixels,
     /// Of each group, one past the last entry that supports a label of it.
     pub(super) ends: [u32; GROUPS],
     /// Added to the remainder 1 - c_i under coverage normalisation: `S_end / A`.
@@ -51,6 +54,7 @@ pub(super) struct TileInstances<'a> {
 }
 
 /// Running state of the instance pass.
+#[repr(C, align(64))]
 struct Replay<'a> {
     transmittance: TilePixels,
     /// 1 - c_i.
@@ -58,7 +62,7 @@ struct Replay<'a> {
     /// Of the splat, at the tile's labels.
     probabilities: Vec<f32>,
     /// Responsibility of the splat for each of the tile's labels.
-    mass: Vec<Lanes>,
+    mass: Vec<Aligned<Lanes>>,
     instances: &'a TileInstances<'a>,
 }
 
@@ -69,7 +73,7 @@ impl<'a> Replay<'a> {
             transmittance: instances.inverse_probability.each_ref().map(|lanes| lanes.each_ref().map(starts)),
             remainder: [[1.0; LANES]; GROUPS],
             probabilities: vec![0.0; instances.labels.labels.len()],
-            mass: vec![[0.0; LANES]; instances.labels.labels.len()],
+            mass: vec![Aligned([0.0; LANES]); instances.labels.labels.len()],
             instances,
         }
     }
@@ -191,12 +195,12 @@ impl<S: Simd> Seen<S> {
         sums.responsibility += q;
         match labels.uniform[group] {
             Some(slot) => {
-                let mass = &mut replay.mass[slot as usize];
+                let Aligned(mass) = &mut replay.mass[slot as usize];
                 (load(simd, mass) + r).store_array(mass);
             }
             None => {
                 for (lane, r) in r.to_array().into_iter().enumerate() {
-                    replay.mass[labels.slots[group][lane] as usize][lane] += r;
+                    replay.mass[labels.slots[group][lane] as usize].0[lane] += r;
                 }
             }
         }
@@ -204,12 +208,12 @@ impl<S: Simd> Seen<S> {
     }
 }
 
-/// Writes one gradient per entry; `label_mass` gets `[entries, labels]` weighted responsibilities.
+/// Writes one gradient per entry, given where the forward pass met it; `label_mass` gets `[entries, labels]` weighted responsibilities.
 #[simd]
 pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
     simd: S,
     splats: &[Splat],
-    entries: &[TileEntry],
+    (entries, met): (&[TileEntry], &[MetGroups]),
     place: &TilePlace,
     cotangents: &mut TileCotangents,
     instances: Option<&TileInstances<'_>>,
@@ -218,8 +222,8 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
 ) {
     let (zero, one) = (splat(simd, 0.0), splat(simd, 1.0));
     let blending = BlendingRule::new(simd);
-    let mut transmittance = place.initial_transmittance();
-    let mut live_color = live(&transmittance);
+    let mut transmittance = Aligned(place.initial_transmittance());
+    let mut live_color = live(&transmittance.0);
     let mut live_instances = Groups::default();
     let mut replay = instances.filter(|_| INSTANCES).map(Replay::new);
     if let Some(replay) = &replay {
@@ -233,18 +237,16 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
     let moves_geometry = instances.is_some_and(|instances| instances.geometry != GeometryPath::Off);
     let weight = instances.map_or(0.0, |instances| instances.weight);
 
-    for (pair, entry) in entries.iter().enumerate() {
+    for (pair, (entry, met)) in entries.iter().zip(met).enumerate() {
         if live_color.union(live_instances).is_empty() {
             break;
         }
-        let wanted = entry.wanted::<INSTANCES>(live_color, live_instances);
-        if wanted[0].union(wanted[1]).is_empty() {
+        let [in_color, in_instances] = met.live::<INSTANCES>(live_color, live_instances);
+        if in_color.union(in_instances).is_empty() {
             continue;
         }
         let s = &splats[entry.rank()];
-        let Some(prepared) = prepare(simd, s, place, wanted) else { continue };
-        let prepared: SplatInTile<S> = prepared;
-        let [in_color, in_instances] = prepared.groups;
+        let prepared: SplatInTile<S> = SplatInTile::new(simd, s, place, [in_color, in_instances]);
         let seen = Seen {
             blending,
             one,
@@ -260,7 +262,7 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
         for group in in_color.without(in_instances) {
             let at = prepared.footprint(simd, group);
             let (v_sigma, finished) =
-                seen.color_backward(simd, &at, group, &mut transmittance, cotangents, &mut sums);
+                seen.color_backward(simd, &at, group, &mut transmittance.0, cotangents, &mut sums);
             live_color.finish(group, finished);
             sums.add_moments(&at, v_sigma, v_sigma);
         }
@@ -270,11 +272,11 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
         {
             let labels = &replay.instances.labels.labels;
             replay.instances.rows.at_labels(s.gaussian, labels, &mut replay.probabilities);
-            replay.mass.fill([0.0; LANES]);
+            replay.mass.fill(Aligned([0.0; LANES]));
             for group in in_color.both(in_instances) {
                 let at = prepared.footprint(simd, group);
                 let (v_sigma, finished) =
-                    seen.color_backward(simd, &at, group, &mut transmittance, cotangents, &mut sums);
+                    seen.color_backward(simd, &at, group, &mut transmittance.0, cotangents, &mut sums);
                 live_color.finish(group, finished);
                 let (q, finished) = seen.instances_backward(simd, &at, (pair, group), replay, &mut sums);
                 live_instances.finish(group, finished);
@@ -291,7 +293,7 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
             }
             let slots = replay.mass.len();
             for (out, mass) in label_mass[pair * slots..(pair + 1) * slots].iter_mut().zip(&replay.mass) {
-                *out = weight * sum(simd, load(simd, mass));
+                *out = weight * sum(simd, load(simd, &mass.0));
             }
         }
         gradients[pair] = sums.finish(simd, s);

@@ -9,7 +9,8 @@
 use fearless_simd::prelude::*;
 use fearless_simd::{f32x16, mask32x16};
 
-use super::pixels::{LANES, Lanes, exp2_negative, load, splat};
+use super::functions::exp2_negative;
+use super::pixels::{LANES, Lanes, load, splat};
 use super::project::Splat;
 use crate::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
 
@@ -22,8 +23,14 @@ const COLUMNS: usize = 8;
 /// Groups of a half tile.
 const PAIRS: usize = GROUPS / 2;
 
-/// One value per pixel of a tile.
+/// One value per pixel of a tile. Structures that hold some begin a cache line with them, so that no vector lies across
+/// two.
 pub(super) type TilePixels = [Lanes; GROUPS];
+
+/// A value that begins a cache line.
+#[derive(Clone, Copy, Debug)]
+#[repr(align(64))]
+pub(super) struct Aligned<T>(pub(super) T);
 
 /// Pixel column and row of a lane inside its tile.
 pub(super) fn pixel_in_tile(group: usize, lane: usize) -> (u32, u32) {
@@ -150,34 +157,33 @@ pub(super) struct SplatInTile<S: Simd> {
 
 /// The groups that the drawn ellipses of a splat may touch, of those `wanted` by each pass.
 ///
-/// The interval of x drawn in each row is found for all rows at once: `u0^2 <= 2 reach - u1^2`. It is a hair wider
-/// than exact, so that rounding never hides a drawn pixel; the gate itself decides.
+/// All rows at once: the nearest point to the ellipse's centre line of a row of eight pixels is drawn when
+/// `u0^2 <= 2 reach - u1^2` there. It is a hair wider than exact, so that rounding never hides a drawn pixel; the gate
+/// itself decides.
 #[inline(always)]
 fn touched<S: Simd>(simd: S, s: &Splat, first: f32, dy: f32, wanted: [Groups; 2]) -> [Groups; 2] {
     let [l00, l01, l11] = s.factor;
-    let inverse = 1.0 / l00;
-    let slope = l01 * inverse;
+    let zero = splat(simd, 0.0);
     let row_dy = splat(simd, dy) - load(simd, &ROWS);
     let bend = row_dy * row_dy * splat(simd, -(l11 * l11));
     // Position of the drawn interval's centre, in pixels from the tile's first pixel centre.
-    let centre = row_dy.mul_add(splat(simd, slope), splat(simd, first));
+    let centre = row_dy.mul_add(splat(simd, l01 / l00), splat(simd, first + 1e-3));
+    // Distances from there to the pixels of each half, 0 inside.
+    let last = (COLUMNS - 1) as f32;
+    let beyond = centre - splat(simd, last + 2e-3);
+    let half = splat(simd, COLUMNS as f32);
+    let left = beyond.max(-centre).max(zero) * l00;
+    let right = (beyond - half).max(half - centre).max(zero) * l00;
+    let squared = [left * left, right * right];
     let mut groups = [Groups::default(); 2];
     for pass in 0..2 {
         if wanted[pass].is_empty() {
             continue;
         }
-        let reach = splat(simd, s.reach[pass] * 2.0 * 1.000_02 + 2e-5);
-        let left = bend + reach;
-        let reaches = left.simd_gt(splat(simd, 0.0));
-        let half_width = left.max(splat(simd, 0.0)).sqrt().mul_add(splat(simd, inverse), splat(simd, 1e-3));
-        let (low, high) = (centre - half_width, centre + half_width);
+        let room = bend + splat(simd, s.reach[pass] * 2.0 * 1.000_02 + 2e-5);
         let mut rows = 0_u32;
         for half in 0..2 {
-            let start = (half * COLUMNS) as f32;
-            let hits = reaches
-                & high.simd_ge(splat(simd, start))
-                & low.simd_le(splat(simd, start + (COLUMNS - 1) as f32));
-            rows |= (hits.to_bitmask() as u32) << (half * ROWS.len());
+            rows |= (squared[half].simd_le(room).to_bitmask() as u32) << (half * ROWS.len());
         }
         groups[pass] = Groups((rows | rows >> 1) & 0x5555_5555).both(wanted[pass]);
     }
@@ -198,14 +204,25 @@ pub(super) fn prepare<S: Simd>(
     if groups[0].union(groups[1]).is_empty() {
         return None;
     }
-    let [l00, l01, l11] = s.binary_factor();
-    let (l00, l01, l11) = (splat(simd, l00), splat(simd, l01), splat(simd, l11));
-    let columns = load(simd, &LANE_COLUMNS);
-    let dy = splat(simd, first_dy) - load(simd, &LANE_ROWS);
-    let sideways = l01 * dy;
-    let left = (splat(simd, first) - columns).mul_add(l00, sideways);
-    let right = (splat(simd, first - COLUMNS as f32) - columns).mul_add(l00, sideways);
-    Some(SplatInTile { u0: [left, right], u1: l11 * dy, l01, l11, groups })
+    Some(SplatInTile::new(simd, s, place, groups))
+}
+
+/// The groups in which each pass met a splat.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct MetGroups(u32);
+
+impl MetGroups {
+    #[inline(always)]
+    pub(super) fn new([color, instances]: [Groups; 2]) -> Self {
+        Self(color.0 | instances.0 << 1)
+    }
+
+    /// Those that are still live in each pass.
+    #[inline(always)]
+    pub(super) fn live<const INSTANCES: bool>(self, color: Groups, instances: Groups) -> [Groups; 2] {
+        let met = Groups(self.0 >> 1 & 0x5555_5555);
+        [Groups(self.0).both(color), if INSTANCES { met.both(instances) } else { Groups::default() }]
+    }
 }
 
 /// A splat on the pixels of a group.
@@ -219,6 +236,21 @@ pub(super) struct Footprint<S: Simd> {
 }
 
 impl<S: Simd> SplatInTile<S> {
+    /// A splat that touches these groups.
+    #[inline(always)]
+    pub(super) fn new(simd: S, s: &Splat, place: &TilePlace, groups: [Groups; 2]) -> Self {
+        let first = s.mean[0] - (place.x as f32 + 0.5);
+        let first_dy = s.mean[1] - (place.y as f32 + 0.5);
+        let [l00, l01, l11] = s.binary_factor();
+        let (l00, l01, l11) = (splat(simd, l00), splat(simd, l01), splat(simd, l11));
+        let columns = load(simd, &LANE_COLUMNS);
+        let dy = splat(simd, first_dy) - load(simd, &LANE_ROWS);
+        let sideways = l01 * dy;
+        let left = (splat(simd, first) - columns).mul_add(l00, sideways);
+        let right = (splat(simd, first - COLUMNS as f32) - columns).mul_add(l00, sideways);
+        Self { u0: [left, right], u1: l11 * dy, l01, l11, groups }
+    }
+
     #[inline(always)]
     pub(super) fn footprint(&self, simd: S, group: usize) -> Footprint<S> {
         let row = splat(simd, ROWS_BEFORE[group % PAIRS]);

@@ -1,18 +1,25 @@
 //! Structural similarity and its gradient. Source: Wang et al. 2004; gradient from methods reference 1.4.
 //!
-//! The five blurred maps of the similarity are made and used band by band, so that they stay in the cache of the thread
-//! that works on the band; only the three maps that the gradient blurs again are kept for the whole image.
+//! Rows pass through once: each is blurred along itself into a ring of as many rows as the window has, and the ring is
+//! blurred across into one row of results, so that all of it stays in the cache of the thread that works on a band. Only
+//! the three maps that the gradient blurs again are kept for the whole image.
 
 use std::sync::OnceLock;
 
+use bytemuck::{Pod, Zeroable};
 use cif_geometry::PixelGrid;
-use fearless_simd::{Level, dispatch};
+use fearless_simd::prelude::*;
+use fearless_simd::{Level, dispatch, f32x16};
+use fearless_simd_macros::simd;
 use rayon::prelude::*;
 
-use super::unit;
+use super::{LANES, row_sum, unit};
 
 /// Half the window: 11 taps.
 pub(crate) const RADIUS: usize = 5;
+
+/// Taps of the window.
+const TAPS: usize = 2 * RADIUS + 1;
 
 /// Standard deviation of the window, pixels.
 const SIGMA: f64 = 1.5;
@@ -21,8 +28,8 @@ const SIGMA: f64 = 1.5;
 pub(crate) const C1: f32 = 1e-4;
 pub(crate) const C2: f32 = 9e-4;
 
-/// Rows of a band. Each is blurred along its rows with [`RADIUS`] rows more above and below.
-const BAND: usize = 16;
+/// Rows of a band. Each band also blurs [`RADIUS`] rows above and below along themselves.
+const BAND: usize = 32;
 
 /// Channels of a pixel, which lie side by side.
 const CHANNELS: usize = 3;
@@ -30,20 +37,28 @@ const CHANNELS: usize = 3;
 /// Memory kept between calls.
 #[derive(Clone, Debug, Default)]
 pub struct SsimScratch {
-    /// `v D`, `v E` and `v F` of every value, before they are blurred.
-    maps: [Vec<f32>; 3],
+    /// `v D`, `v E` and `v F` of every value, before they are blurred; rows are padded.
+    maps: [Vec<Vector>; 3],
 }
 
-/// Memory of one band at work.
-#[derive(Default)]
-struct Band {
-    /// A row between zeros.
-    padded: Vec<f32>,
-    /// Maps blurred along their rows, `[rows with those around, values of a row]` each.
-    along: [Vec<f32>; 5],
-    /// Maps blurred both ways, `[rows, values of a row]` each.
-    blurred: [Vec<f32>; 5],
+/// Memory of one band at work, for some maps at once.
+struct Band<const MAPS: usize> {
+    /// Values of a row.
+    length: usize,
+    /// Vectors of a row.
+    vectors: usize,
+    /// A row of each map between zeros.
+    padded: [Vec<f32>; MAPS],
+    /// The last rows blurred along themselves, `[TAPS, vectors]`; a row lies at its index modulo [`TAPS`].
+    ring: [Vec<Vector>; MAPS],
+    /// A row blurred both ways.
+    blurred: [Vec<Vector>; MAPS],
 }
+
+/// Values that begin a cache line, so that no load goes across two.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C, align(64))]
+struct Vector([f32; LANES]);
 
 /// Normalised taps from the centre outwards.
 pub(crate) fn window() -> [f32; RADIUS + 1] {
@@ -55,61 +70,94 @@ pub(crate) fn window() -> [f32; RADIUS + 1] {
     })
 }
 
-/// The row of a band with its surroundings: `None` above and below the image, which counts as zeros.
-fn row_of(start: usize, around: usize, height: usize) -> Option<usize> {
-    (start + around).checked_sub(RADIUS).filter(|row| *row < height)
-}
+/// Zeros on either side of a row.
+const MARGIN: usize = RADIUS * CHANNELS;
 
-impl Band {
-    /// Blurs a row of values into one of the maps; `value` gives the values, one by one.
-    #[inline(always)]
-    fn blur_along(&mut self, map: usize, around: usize, length: usize, value: impl Fn(usize) -> f32) {
-        const MARGIN: usize = RADIUS * CHANNELS;
-        self.padded.resize(length + 2 * MARGIN, 0.0);
-        for (k, padded) in self.padded[MARGIN..MARGIN + length].iter_mut().enumerate() {
-            *padded = value(k);
+impl<const MAPS: usize> Band<MAPS> {
+    fn new(length: usize) -> Self {
+        let vectors = length.div_ceil(LANES);
+        Self {
+            length,
+            vectors,
+            padded: std::array::from_fn(|_| vec![0.0; vectors * LANES + 2 * MARGIN]),
+            ring: std::array::from_fn(|_| vec![Vector([0.0; LANES]); TAPS * vectors]),
+            blurred: std::array::from_fn(|_| vec![Vector([0.0; LANES]); vectors]),
         }
-        let out = &mut self.along[map];
-        out.resize((BAND + 2 * RADIUS) * length, 0.0);
-        let out = &mut out[around * length..(around + 1) * length];
-        blurred(out, |tap| &self.padded[tap * CHANNELS..][..length]);
+    }
+
+    /// The padded rows, without their margins.
+    #[inline(always)]
+    fn rows_mut(&mut self) -> [&mut [f32]; MAPS] {
+        let length = self.length;
+        self.padded.each_mut().map(|row| &mut row[MARGIN..MARGIN + length])
+    }
+
+    /// Blurs the padded rows along themselves into the ring, as row `row` counted from [`RADIUS`] above the band.
+    #[inline(always)]
+    fn blur_along<S: Simd>(&mut self, simd: S, row: usize) {
+        let (place, vectors, taps) = (row % TAPS * self.vectors, self.vectors, window());
+        for (padded, ring) in self.padded.iter().zip(&mut self.ring) {
+            let mut at = [&padded.as_chunks::<LANES>().0[..vectors]; TAPS];
+            for (tap, at) in at.iter_mut().enumerate() {
+                *at = &padded[tap * CHANNELS..].as_chunks::<LANES>().0[..vectors];
+            }
+            for (k, Vector(out)) in ring[place..place + vectors].iter_mut().enumerate() {
+                let mut under = [f32x16::splat(simd, 0.0); TAPS];
+                for tap in 0..TAPS {
+                    under[tap] = load(simd, &at[tap][k]);
+                }
+                blurred(simd, &taps, under).store_array(out);
+            }
+        }
     }
 
     /// Sets a row outside the image to zero.
-    fn clear_along(&mut self, maps: usize, around: usize, length: usize) {
-        for out in &mut self.along[..maps] {
-            out.resize((BAND + 2 * RADIUS) * length, 0.0);
-            out[around * length..(around + 1) * length].fill(0.0);
+    fn clear(&mut self, row: usize) {
+        let place = row % TAPS * self.vectors;
+        for ring in &mut self.ring {
+            ring[place..place + self.vectors].fill(Vector([0.0; LANES]));
         }
     }
 
-    /// Blurs the first maps across their rows.
+    /// Blurs the ring across, whose first row is `row`.
     #[inline(always)]
-    fn blur_across(&mut self, maps: usize, rows: usize, length: usize) {
-        for (out, along) in self.blurred[..maps].iter_mut().zip(&self.along) {
-            out.resize(BAND * length, 0.0);
-            for (row, out) in out.chunks_exact_mut(length).take(rows).enumerate() {
-                blurred(out, |tap| &along[(row + tap) * length..][..length]);
+    fn blur_across<S: Simd>(&mut self, simd: S, row: usize) {
+        let (vectors, taps) = (self.vectors, window());
+        for (ring, out) in self.ring.iter().zip(&mut self.blurred) {
+            let mut at = [&ring[..vectors]; TAPS];
+            for (tap, at) in at.iter_mut().enumerate() {
+                *at = &ring[(row + tap) % TAPS * vectors..][..vectors];
+            }
+            for (k, Vector(out)) in out[..vectors].iter_mut().enumerate() {
+                let mut under = [f32x16::splat(simd, 0.0); TAPS];
+                for tap in 0..TAPS {
+                    under[tap] = load(simd, &at[tap][k].0);
+                }
+                blurred(simd, &taps, under).store_array(out);
             }
         }
     }
 }
 
-/// Sums values under the window, `at` giving those that lie under each of its taps, from the first to the last.
+/// Sum of the values under the taps of the window.
 #[inline(always)]
-fn blurred<'a>(out: &mut [f32], at: impl Fn(usize) -> &'a [f32]) {
-    let taps = window();
-    let centre = at(RADIUS);
-    let [[a1, b1], [a2, b2], [a3, b3], [a4, b4], [a5, b5]] =
-        [1, 2, 3, 4, 5].map(|k| [at(RADIUS - k), at(RADIUS + k)]);
-    for k in 0..out.len() {
-        out[k] = taps[0] * centre[k]
-            + taps[1] * (a1[k] + b1[k])
-            + taps[2] * (a2[k] + b2[k])
-            + taps[3] * (a3[k] + b3[k])
-            + taps[4] * (a4[k] + b4[k])
-            + taps[5] * (a5[k] + b5[k]);
+fn blurred<S: Simd>(simd: S, taps: &[f32; RADIUS + 1], under: [f32x16<S>; TAPS]) -> f32x16<S> {
+    let mut sum = under[RADIUS] * taps[0];
+    for distance in 1..=RADIUS {
+        let pair = under[RADIUS - distance] + under[RADIUS + distance];
+        sum = pair.mul_add(f32x16::splat(simd, taps[distance]), sum);
     }
+    sum
+}
+
+/// The first values of some vectors.
+fn flattened(vectors: &[Vector], length: usize) -> &[f32] {
+    &bytemuck::cast_slice(vectors)[..length]
+}
+
+#[inline(always)]
+fn load<S: Simd>(simd: S, values: &[f32; LANES]) -> f32x16<S> {
+    f32x16::load_array_ref(simd, values)
 }
 
 impl SsimScratch {
@@ -123,112 +171,128 @@ impl SsimScratch {
     ) -> f64 {
         let (x, y) = (rendered.pixels.as_flattened(), target.pixels.as_flattened());
         let length = (rendered.width as usize).max(1) * CHANNELS;
-        let height = x.len() / length;
+        let vectors = length.div_ceil(LANES);
         for map in &mut self.maps {
-            map.resize(x.len(), 0.0);
+            map.resize(x.len() / length * vectors, Vector([0.0; LANES]));
         }
         let v = (f64::from(weight) / x.len().max(1) as f64) as f32;
         let level = Level::new();
         let [d, e, f] = &mut self.maps;
-        let size = BAND * length;
+        let size = BAND * vectors;
         // Sums of bands are added in order, so that the value does not depend on threads.
         let sums: Vec<f64> = d
             .par_chunks_mut(size)
             .zip(e.par_chunks_mut(size))
             .zip(f.par_chunks_mut(size))
             .enumerate()
-            .map_init(Band::default, |band, (index, ((d, e), f))| {
-                let rows = (index * BAND, height);
-                dispatch!(level, _simd => similarity(band, (x, y), rows, length, v, [&mut *d, &mut *e, &mut *f]))
-            })
+            .map_init(
+                || Band::new(length),
+                |band, (index, ((d, e), f))| {
+                    dispatch!(level, simd => similarity(simd, band, (x, y), index * BAND, v, [&mut *d, &mut *e, &mut *f]))
+                },
+            )
             .collect();
         let maps = &self.maps;
-        v_color.pixels.as_flattened_mut().par_chunks_mut(size).enumerate().for_each_init(
-            Band::default,
+        v_color.pixels.as_flattened_mut().par_chunks_mut(BAND * length).enumerate().for_each_init(
+            || Band::new(length),
             |band, (index, v_color)| {
-                let rows = (index * BAND, height);
-                dispatch!(level, _simd => add_blurred(band, maps, (x, y), rows, length, v_color));
+                dispatch!(level, simd => add_blurred(simd, band, maps, (x, y), index * BAND, v_color));
             },
         );
         sums.iter().sum::<f64>() / x.len().max(1) as f64
     }
 }
 
-/// Sum of the similarity of a band that starts at a row of an image of some height, and its `v D`, `v E`, `v F`.
-#[inline(always)]
-fn similarity(
-    band: &mut Band,
+/// Sum of the similarity of a band that starts at a row of an image, and its `v D`, `v E`, `v F`.
+#[simd]
+fn similarity<S: Simd>(
+    simd: S,
+    band: &mut Band<5>,
     (x, y): (&[f32], &[u8]),
-    (start, height): (usize, usize),
-    length: usize,
+    start: usize,
     v: f32,
-    [d, e, f]: [&mut [f32]; 3],
+    [d, e, f]: [&mut [Vector]; 3],
 ) -> f64 {
-    let rows = d.len() / length;
-    for around in 0..rows + 2 * RADIUS {
-        let Some(row) = row_of(start, around, height) else {
-            band.clear_along(5, around, length);
-            continue;
-        };
-        let (x, y) = (&x[row * length..][..length], &y[row * length..][..length]);
-        band.blur_along(0, around, length, |k| x[k]);
-        band.blur_along(1, around, length, |k| unit(y[k]));
-        band.blur_along(2, around, length, |k| x[k] * x[k]);
-        band.blur_along(3, around, length, |k| unit(y[k]) * unit(y[k]));
-        band.blur_along(4, around, length, |k| x[k] * unit(y[k]));
-    }
-    band.blur_across(5, rows, length);
-    let count = d.len();
-    let [m1, m2, xx, yy, xy] = band.blurred.each_ref().map(|map| &map[..count]);
-    let (d, e, f) = (&mut d[..count], &mut e[..count], &mut f[..count]);
+    let length = band.length;
+    let (height, rows) = (x.len() / length, d.len() / band.vectors);
     let mut sum = 0.0;
-    // In parts of few values, whose sum in single precision is as good as exact.
-    for part in (0..count).step_by(64) {
-        let mut part_sum = [0.0_f32; 8];
-        for k in part..(part + 64).min(count) {
-            let (m1, m2) = (m1[k], m2[k]);
-            let (s1, s2, s12) = (xx[k] - m1 * m1, yy[k] - m2 * m2, xy[k] - m1 * m2);
-            let (luminance, structure) = (2.0 * m1 * m2 + C1, 2.0 * s12 + C2);
-            let (c, s) = (m1 * m1 + m2 * m2 + C1, s1 + s2 + C2);
-            let similarity = luminance * structure / (c * s);
-            part_sum[k % 8] += similarity;
-            d[k] = v
-                * (2.0 * m2 * (structure - luminance) / (c * s) - 2.0 * m1 * similarity / c
-                    + 2.0 * m1 * similarity / s);
-            e[k] = v * (-similarity / s);
-            f[k] = v * (2.0 * luminance / (c * s));
+    for around in 0..rows + 2 * RADIUS {
+        match (start + around).checked_sub(RADIUS).filter(|row| *row < height) {
+            None => band.clear(around),
+            Some(row) => {
+                let (x, y) = (&x[row * length..][..length], &y[row * length..][..length]);
+                let [m1, m2, xx, yy, xy] = band.rows_mut();
+                for k in 0..length {
+                    let (x, y) = (x[k], unit(y[k]));
+                    (m1[k], m2[k], xx[k], yy[k], xy[k]) = (x, y, x * x, y * y, x * y);
+                }
+                band.blur_along(simd, around);
+            }
         }
-        sum += part_sum.iter().copied().map(f64::from).sum::<f64>();
+        let Some(row) = around.checked_sub(2 * RADIUS) else { continue };
+        band.blur_across(simd, row);
+        let vectors = band.vectors;
+        let [d, e, f] = [&mut *d, &mut *e, &mut *f].map(|map| &mut map[row * vectors..][..vectors]);
+        compare(simd, &mut band.blurred, v, [d, e, f]);
+        sum += row_sum(flattened(&band.blurred[0], length), |here| here);
     }
     sum
 }
 
-/// Adds the blurred maps of a band, times what the similarity depends on, to its gradient.
+/// The similarity of a row from its blurred maps, of which it replaces the first; and `v D`, `v E`, `v F`.
 #[inline(always)]
-fn add_blurred(
-    band: &mut Band,
-    maps: &[Vec<f32>; 3],
+fn compare<S: Simd>(simd: S, blurred: &mut [Vec<Vector>; 5], v: f32, [d, e, f]: [&mut [Vector]; 3]) {
+    let [similarity, m2, xx, yy, xy] = blurred;
+    let one = f32x16::splat(simd, 1.0);
+    let maps = similarity.iter_mut().zip(m2).zip(xx).zip(yy).zip(xy);
+    for (((((((first, m2), xx), yy), xy), d), e), f) in maps.zip(d).zip(e).zip(f) {
+        let (m1, m2) = (load(simd, &first.0), load(simd, &m2.0));
+        let product = m1 * m2;
+        let squares = m1.mul_add(m1, m2 * m2);
+        let luminance = product * 2.0 + C1;
+        let structure = (load(simd, &xy.0) - product) * 2.0 + C2;
+        let over_c = one / (squares + C1);
+        let over_s = one / (load(simd, &xx.0) + load(simd, &yy.0) - squares + C2);
+        let over_both = over_c * over_s * (2.0 * v);
+        let here = luminance * structure * over_c * over_s;
+        here.store_array(&mut first.0);
+        let along = m1 * here * (over_s - over_c) * (2.0 * v);
+        (m2 * (structure - luminance)).mul_add(over_both, along).store_array(&mut d.0);
+        (here * over_s * -v).store_array(&mut e.0);
+        (luminance * over_both).store_array(&mut f.0);
+    }
+}
+
+/// Adds the blurred maps of a band that starts at a row, times what the similarity depends on, to its gradient.
+#[simd]
+fn add_blurred<S: Simd>(
+    simd: S,
+    band: &mut Band<3>,
+    maps: &[Vec<Vector>; 3],
     (x, y): (&[f32], &[u8]),
-    (start, height): (usize, usize),
-    length: usize,
+    start: usize,
     v_color: &mut [f32],
 ) {
-    let rows = v_color.len() / length;
+    let (length, vectors) = (band.length, band.vectors);
+    let (height, rows) = (x.len() / length, v_color.len() / length);
     for around in 0..rows + 2 * RADIUS {
-        let Some(row) = row_of(start, around, height) else {
-            band.clear_along(3, around, length);
-            continue;
-        };
-        for (map, values) in maps.iter().enumerate() {
-            let values = &values[row * length..][..length];
-            band.blur_along(map, around, length, |k| values[k]);
+        match (start + around).checked_sub(RADIUS).filter(|row| *row < height) {
+            None => band.clear(around),
+            Some(row) => {
+                for (padded, map) in band.rows_mut().into_iter().zip(maps) {
+                    padded.copy_from_slice(flattened(&map[row * vectors..][..vectors], length));
+                }
+                band.blur_along(simd, around);
+            }
         }
-    }
-    band.blur_across(3, rows, length);
-    let count = v_color.len();
-    let (x, y) = (&x[start * length..][..count], &y[start * length..][..count]);
-    let [d, e, f, ..] = band.blurred.each_ref().map(|map| &map[..map.len().min(count)]);
-    for k in 0..count {
-        v_color[k] += d[k] + 2.0 * x[k] * e[k] + unit(y[k]) * f[k];
+        let Some(row) = around.checked_sub(2 * RADIUS) else { continue };
+        band.blur_across(simd, row);
+        let here = (start + row) * length;
+        let (x, y) = (&x[here..][..length], &y[here..][..length]);
+        let [d, e, f] = band.blurred.each_ref().map(|map| flattened(map, length));
+        let v_color = &mut v_color[row * length..][..length];
+        for k in 0..length {
+            v_color[k] += d[k] + 2.0 * x[k] * e[k] + unit(y[k]) * f[k];
+        }
     }
 }

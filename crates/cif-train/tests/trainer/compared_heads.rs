@@ -260,6 +260,7 @@ fn losses(mut trainer: Trainer) -> (Vec<f64>, Field) {
 
 #[cfg(feature = "wgpu")]
 #[test]
+#[ignore = "long: make test-long"]
 fn heads_learn_the_same_on_a_gpu() {
     let Some(gpu) = cif_render::wgpu::testing::gpu() else { return };
     let heads =

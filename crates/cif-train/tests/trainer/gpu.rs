@@ -225,6 +225,7 @@ fn judging_config() -> TrainConfig {
 }
 
 #[test]
+#[ignore = "long: make test-long"]
 fn effects_earn_their_place_on_the_same_steps_as_on_the_processor() {
     let Some(gpu) = testing::gpu() else { return };
     let folder = tempfile::tempdir().unwrap();

@@ -245,6 +245,7 @@ fn an_object_of_which_nothing_tells_the_distance_is_named() {
 }
 
 #[test]
+#[ignore = "long: make test-long"]
 fn neither_threads_nor_interruptions_change_the_result() {
     let folder = tempfile::tempdir().unwrap();
     same_result(folder.path(), &dataset(folder.path(), 6), &[30, 60]);

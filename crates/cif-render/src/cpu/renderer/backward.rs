@@ -10,12 +10,13 @@ use super::super::deform::DeformationAtTime;
 use super::super::groups::groups_backward;
 use super::super::labels::{IdentityRows, TileLabels};
 use super::super::pixels::LANES;
-use super::super::project::{PosedGradient, SplatGradient, ViewConstants, project_backward};
+use super::super::posed::PosedView;
+use super::super::project::ViewConstants;
+use super::super::project_backward::{PosedGradient, Seen, SplatGradient, project_backward};
 use super::super::rasterize::TileImage;
 use super::super::rasterize_backward::{TileCotangents, TileInstances, rasterize_tile_backward};
 use super::super::tile::{GROUPS, TilePixels, TilePlace};
 use super::super::timing::timed;
-use super::pose::PosedView;
 use super::{CHUNK, NOT_VISIBLE, Renderer};
 use crate::constants::MIN_LABEL_PROBABILITY;
 use crate::{Gradients, InstanceNormalisation, RenderSettings};
@@ -212,7 +213,7 @@ impl Renderer {
                 return;
             }
             let place = self.place(tile);
-            let entries = lists.tile(tile);
+            let entries = (lists.tile(tile), &tape.tiles[tile].met[..]);
             let mut cotangents = tile_cotangents(&place, &v_color.pixels, &tape.color);
             if let Some(v_alpha) = v_alpha {
                 add_alpha(&mut cotangents, &place, &v_alpha.pixels, &tape.tiles[tile].transmittance);
@@ -269,9 +270,9 @@ impl Renderer {
             .zip(gradients.radii.par_chunks_mut(CHUNK))
             .enumerate()
             .for_each(|(chunk, (((total, of_view), screen), radii))| {
-                dispatch!(level, _simd => for row in 0..radii.len() {
-                    let gaussian = chunk * CHUNK + row;
-                    let rank = rank_of[gaussian];
+                let mut found = Vec::with_capacity(radii.len());
+                for row in 0..radii.len() {
+                    let rank = rank_of[chunk * CHUNK + row];
                     if rank == NOT_VISIBLE {
                         continue;
                     }
@@ -281,37 +282,49 @@ impl Renderer {
                     for &pair in tape.lists.pairs_of(rank as usize) {
                         v.add(&pairs[pair as usize]);
                     }
-                    if v == SplatGradient::default() {
-                        continue;
+                    if v != SplatGradient::default() {
+                        found.push((row, splat, v));
                     }
-                    let sh = if moves_sh && has_posed_sh(field, gaussian) {
-                        &mut of_view.sh_coefficients[row]
-                    } else {
-                        &mut total.sh_coefficients[row]
-                    };
-                    let PosedGradient { mean, log_scale, quaternion, opacity_logit, occupancy_logit } =
-                        project_backward(view, &posed.at(gaussian), splat, &v, sh);
-                    for axis in 0..2 {
-                        screen[row][axis] += half[axis] * v.mean[axis];
+                }
+                for found in found.chunks(LANES) {
+                    let mut seen = Seen::new(posed.sh(found[0].1.gaussian as usize));
+                    for (lane, (_, splat, v)) in found.iter().enumerate() {
+                        let gaussian = splat.gaussian as usize;
+                        seen.set(lane, (posed.row(gaussian), posed.sh(gaussian)), splat, v);
                     }
-                    for axis in 0..3 {
-                        total.log_scales[row][axis] += log_scale[axis];
-                    }
-                    if field.tracks.as_ref().and_then(|tracks| tracks.group(gaussian)).is_none() {
+                    let posed_gradients = dispatch!(level, simd => project_backward(simd, view, &seen));
+                    for (lane, (row, splat, v)) in found.iter().enumerate() {
+                        let (row, gaussian) = (*row, splat.gaussian as usize);
+                        let sh = if moves_sh && has_posed_sh(field, gaussian) {
+                            &mut of_view.sh_coefficients[row]
+                        } else {
+                            &mut total.sh_coefficients[row]
+                        };
+                        posed_gradients.add_sh(lane, sh);
+                        let PosedGradient { mean, log_scale, quaternion, opacity_logit, occupancy_logit } =
+                            posed_gradients.of(lane);
+                        for axis in 0..2 {
+                            screen[row][axis] += half[axis] * v.mean[axis];
+                        }
                         for axis in 0..3 {
-                            total.means[row][axis] += mean[axis];
+                            total.log_scales[row][axis] += log_scale[axis];
                         }
-                        for axis in 0..4 {
-                            total.quaternions[row][axis] += quaternion[axis];
+                        if field.tracks.as_ref().and_then(|tracks| tracks.group(gaussian)).is_none() {
+                            for axis in 0..3 {
+                                total.means[row][axis] += mean[axis];
+                            }
+                            for axis in 0..4 {
+                                total.quaternions[row][axis] += quaternion[axis];
+                            }
                         }
+                        total.opacity_logits[row] += opacity_logit;
+                        total.occupancy_logits[row] += occupancy_logit;
+                        of_view.means[row] = mean;
+                        of_view.log_scales[row] = log_scale;
+                        of_view.quaternions[row] = quaternion;
+                        of_view.opacity_logits[row] = opacity_logit;
                     }
-                    total.opacity_logits[row] += opacity_logit;
-                    total.occupancy_logits[row] += occupancy_logit;
-                    of_view.means[row] = mean;
-                    of_view.log_scales[row] = log_scale;
-                    of_view.quaternions[row] = quaternion;
-                    of_view.opacity_logits[row] = opacity_logit;
-                });
+                }
             });
     }
 
@@ -432,18 +445,4 @@ fn instance_cotangents(
         }
     }
     (inverse_probability, coverage_ratio)
-}
-
-impl SplatGradient {
-    fn add(&mut self, other: &Self) {
-        for axis in 0..2 {
-            self.mean[axis] += other.mean[axis];
-        }
-        for k in 0..3 {
-            self.moments[k] += other.moments[k];
-            self.color[k] += other.color[k];
-        }
-        self.opacity += other.opacity;
-        self.responsibility += other.responsibility;
-    }
 }

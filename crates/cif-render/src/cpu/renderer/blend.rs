@@ -11,7 +11,7 @@ use super::super::bin::{TileLists, TileRegion};
 use super::super::blend::blend_tile;
 use super::super::blend_backward::{BlendCotangents, blend_tile_backward};
 use super::super::pixels::LANES;
-use super::super::project::SplatGradient;
+use super::super::project_backward::SplatGradient;
 use super::super::tile::{GROUPS, TilePixels, pixel_in_tile};
 use super::super::timing::timed;
 use super::{CHUNK, NOT_VISIBLE, Renderer};

@@ -3,7 +3,8 @@
 use cif_field::Gaussians;
 use cif_field::parameters::{MEANS, MLP, PLANES, Tensor};
 
-use super::super::project::{Splat, SplatGradient};
+use super::super::project::Splat;
+use super::super::project_backward::SplatGradient;
 use super::Renderer;
 use crate::Gradients;
 

@@ -29,11 +29,12 @@ use rayon::prelude::*;
 pub use self::banded::{BandRequest, RenderedBand};
 pub use self::blend::BlendWeightGradients;
 pub use self::inspect::NotFinite;
-use self::pose::{PosedView, pose};
+use self::pose::pose;
 use super::bin::{TileLists, TileRegion, sort_by_depth};
 use super::labels::{IdentityRows, TileLabels};
 use super::level::SimdLevel;
-use super::project::{Splat, ViewConstants, project};
+use super::posed::PosedView;
+use super::project::{Splat, ViewConstants, project_rows};
 use super::rasterize::{TileImage, rasterize_tile};
 use super::tile::{GROUPS, TilePlace};
 use super::timing::{StageTimes, timed};
@@ -212,12 +213,7 @@ impl Renderer {
                 .map(|chunk| {
                     let rows = chunk * CHUNK..n.min((chunk + 1) * CHUNK);
                     let mut splats = Vec::with_capacity(rows.len());
-                    // No `filter_map`: its closure would not be compiled for the instructions.
-                    dispatch!(level, _simd => for row in rows {
-                        if let Some(splat) = project(&view, &posed.at(row), row as u32) {
-                            splats.push(splat);
-                        }
-                    });
+                    dispatch!(level, simd => project_rows(simd, &view, &posed, rows, &mut splats));
                     splats
                 })
                 .collect();
@@ -308,14 +304,15 @@ impl Renderer {
             images.resize_with(tiles, TileImage::default);
             let rows = labels.map(|(_, rows)| IdentityRows::new(rows, &self.tape.probabilities));
             let (splats, lists) = (&self.tape.splats, &self.tape.lists);
+            let keeps_met = lists.is_by_splat();
             images.par_iter_mut().enumerate().for_each(|(tile, image)| {
                 let place = self.place(tile);
                 let entries = lists.tile(tile);
                 let labels = self.tape.labels[tile].as_ref().zip(rows);
                 dispatch!(level, simd => match (labels.is_some(), depth) {
-                    (true, _) => rasterize_tile::<_, true, false>(simd, splats, entries, &place, labels, image),
-                    (false, true) => rasterize_tile::<_, false, true>(simd, splats, entries, &place, None, image),
-                    (false, false) => rasterize_tile::<_, false, false>(simd, splats, entries, &place, None, image),
+                    (true, _) => rasterize_tile::<_, true, false>(simd, splats, entries, &place, labels, keeps_met, image),
+                    (false, true) => rasterize_tile::<_, false, true>(simd, splats, entries, &place, None, keeps_met, image),
+                    (false, false) => rasterize_tile::<_, false, false>(simd, splats, entries, &place, None, keeps_met, image),
                 });
             });
             self.tape.tiles = images;

@@ -5,7 +5,6 @@ use cif_field::{Deformation, Field, Gaussians};
 use fearless_simd::Level;
 
 use super::super::deform::{DeformationAtTime, begin};
-use super::super::project::Posed;
 use super::Renderer;
 
 /// Highest degree of the spherical harmonics that Gaussians have.
@@ -55,42 +54,4 @@ pub(super) fn pose(
         posed.sh_coefficients.clone_from(&canonical.sh_coefficients);
     }
     tracks.apply(canonical, posed.rows_mut());
-}
-
-/// Posed parameters by row, falling back to the canonical ones where nothing moves.
-pub(super) struct PosedView<'a> {
-    canonical: &'a Gaussians,
-    moved: &'a Gaussians,
-}
-
-impl<'a> PosedView<'a> {
-    pub(super) fn new(canonical: &'a Gaussians, moved: &'a Gaussians) -> Self {
-        Self { canonical, moved }
-    }
-
-    #[inline(always)]
-    pub(super) fn at(&self, row: usize) -> Posed<'a> {
-        let (canonical, moved) = (self.canonical, self.moved);
-        let occupancy_logit = *moved.occupancy_logits.get(row).unwrap_or(&canonical.occupancy_logits[row]);
-        let sh = moved.sh_coefficients.get(row).unwrap_or(&canonical.sh_coefficients[row]);
-        if moved.means.is_empty() {
-            Posed {
-                mean: canonical.means[row],
-                log_scale: canonical.log_scales[row],
-                quaternion: canonical.quaternions[row],
-                opacity_logit: canonical.opacity_logits[row],
-                occupancy_logit,
-                sh,
-            }
-        } else {
-            Posed {
-                mean: moved.means[row],
-                log_scale: moved.log_scales[row],
-                quaternion: moved.quaternions[row],
-                opacity_logit: moved.opacity_logits[row],
-                occupancy_logit,
-                sh,
-            }
-        }
-    }
 }
