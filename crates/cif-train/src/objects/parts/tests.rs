@@ -100,7 +100,7 @@ fn the_lid_of_a_box_turns_on_its_hinge() {
 #[test]
 #[ignore = "long: make test-long"]
 fn the_lid_of_a_box_is_found_before_one_camera() {
-    // It sees at no time how deep the box is: the closed one tells where the lid may turn, if only roughly. Runs that
+    // It sees at no time how deep the box is: the closed one shows where the lid may turn, if only roughly. Runs that
     // differed in rounding alone had axes off by 1.4 and 4.4 deg, and values by 18.6 and 1.4 deg.
     check_lid(|base, lid, pose| seen_always(base, lid, pose, moving), [8.0, 25.0, 0.02]);
 }
