@@ -133,11 +133,11 @@ impl Conic {
             let (u0, u1) = (l00 * x + l01 * y, l11 * y);
             u0 * u0 + u1 * u1
         };
-        // The nearest to the centre of each axis; it lies inside along one that is 0.
+        // The coordinates of the rectangle nearest to the centre: 0 along an axis on which it spans the centre.
         let (x, y) = (0.0_f32.max(x_low).min(x_high), 0.0_f32.max(y_low).min(y_high));
         let beside = twice_sigma(x, (self.slopes[0] * x).max(y_low).min(y_high));
         let above = twice_sigma((self.slopes[1] * y).max(x_low).min(x_high), y);
-        // Where both are 0, so is each; an axis along which the centre is inside has no edge that is nearer.
+        // Only edges that face the centre can hold the smallest; where the centre is inside, `above` is 0.
         match (x == 0.0, y == 0.0) {
             (true, _) => above,
             (_, true) => beside,

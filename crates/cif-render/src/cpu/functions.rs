@@ -99,15 +99,11 @@ pub(super) fn sigmoid<S: Simd>(simd: S, logit: f32x16<S>) -> f32x16<S> {
 
 #[cfg(test)]
 mod tests {
-    use fearless_simd::{Level, dispatch};
+    use fearless_simd::dispatch;
 
     use super::super::SimdLevel;
     use super::super::pixels::{Lanes, load};
     use super::*;
-
-    fn levels() -> Vec<Level> {
-        SimdLevel::available().into_iter().filter_map(SimdLevel::level).collect()
-    }
 
     /// Largest error of `found` over a range, each value in a lane of its own.
     fn worst(low: f32, high: f32, found: impl Fn(&Lanes) -> Lanes, error: impl Fn(f32, f32) -> f64) -> f64 {
@@ -130,7 +126,7 @@ mod tests {
 
     #[test]
     fn functions_are_accurate_on_every_level() {
-        for level in levels() {
+        for level in SimdLevel::levels() {
             let exp2 = |x: &Lanes| dispatch!(level, simd => exp2_negative(simd, load(simd, x)).to_array());
             let error = worst(0.0, 8.0, exp2, |x, found| relative(f64::from(-x).exp2(), found));
             assert!(error < 1.5e-7, "{level:?}: 2^-x {error}");
@@ -153,7 +149,7 @@ mod tests {
 
     #[test]
     fn functions_are_quiet_at_the_ends() {
-        for level in levels() {
+        for level in SimdLevel::levels() {
             let ends = |x: f32| {
                 dispatch!(level, simd => {
                     let x = splat(simd, x);

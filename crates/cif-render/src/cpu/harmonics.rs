@@ -5,8 +5,8 @@ use cif_geometry::spherical_harmonics::{BAND_0, BAND_1, BAND_2, BAND_3, COEFFICI
 use fearless_simd::f32x16;
 use fearless_simd::prelude::*;
 
+use super::gaussian_lanes::Vector;
 use super::pixels::splat;
-use super::vectors::Vector;
 
 /// Factors of a band in single precision.
 const fn single<const N: usize>(factors: [f64; N]) -> [f32; N] {
@@ -104,14 +104,14 @@ mod tests {
     use fearless_simd::dispatch;
 
     use super::super::SimdLevel;
-    use super::super::vectors::splat_vector;
+    use super::super::gaussian_lanes::splat_vector;
     use super::*;
 
     #[test]
     fn basis_and_gradient_are_those_of_the_plain_formulas() {
         let direction = [0.36_f32, -0.48, 0.8];
         let v: [f32; COEFFICIENTS] = std::array::from_fn(|k| (k as f32 * 1.7 + 0.4).sin());
-        for level in SimdLevel::available().into_iter().filter_map(SimdLevel::level) {
+        for level in SimdLevel::levels() {
             for degree in 0..=3 {
                 let (found, back) = dispatch!(level, simd => {
                     let at = splat_vector(simd, direction);

@@ -29,6 +29,12 @@ impl SimdLevel {
         self.level().is_some()
     }
 
+    /// All levels that this processor has, to dispatch to.
+    #[cfg(test)]
+    pub(super) fn levels() -> Vec<Level> {
+        Self::available().into_iter().filter_map(Self::level).collect()
+    }
+
     /// The level to dispatch to; `None` where the processor lacks it.
     pub(super) fn level(self) -> Option<Level> {
         match self {

@@ -5,7 +5,7 @@
 //! | `deform` | canonical Gaussians to the time of the view, and back |
 //! | `posed` | the Gaussians at the time of the view, by row |
 //! | `project`, `project_backward` | Gaussians to splats, and back |
-//! | `vectors`, `functions`, `rotation`, `harmonics` | what they compute with, sixteen Gaussians at a time |
+//! | `gaussian_lanes`, `functions`, `rotation`, `harmonics` | what they compute with, sixteen Gaussians at a time |
 //! | `bin` | depth order and tile lists |
 //! | `bands` | which tiles are drawn at once |
 //! | `tile` | how a splat falls on a tile's pixels and blends: the steps that all of these share: |
@@ -30,6 +30,7 @@ mod counts;
 mod deform;
 mod dense;
 mod functions;
+mod gaussian_lanes;
 mod groups;
 mod harmonics;
 mod identity;
@@ -48,7 +49,6 @@ mod rotation;
 mod tile;
 mod timing;
 mod vector;
-mod vectors;
 
 pub use contributors::{ContributorMass, ContributorRule};
 pub use counts::IdentityCounts;

@@ -54,14 +54,10 @@ pub(super) fn sum_each<S: Simd>(simd: S, vectors: [f32x16<S>; 4]) -> [f32; 4] {
 
 #[cfg(test)]
 mod tests {
-    use fearless_simd::{Level, dispatch};
+    use fearless_simd::dispatch;
 
     use super::super::SimdLevel;
     use super::*;
-
-    fn levels() -> Vec<Level> {
-        SimdLevel::available().into_iter().filter_map(SimdLevel::level).collect()
-    }
 
     #[test]
     fn sums_take_every_lane_once_in_one_order() {
@@ -72,7 +68,7 @@ mod tests {
             let four: [f32; 4] = std::array::from_fn(|k| eight[k] + eight[k + 4]);
             (four[0] + four[2]) + (four[1] + four[3])
         });
-        for level in levels() {
+        for level in SimdLevel::levels() {
             let each = dispatch!(level, simd => sum_each(simd, lanes.map(|l| load(simd, &l))));
             let single = dispatch!(level, simd => lanes.map(|l| sum(simd, load(simd, &l))));
             assert_eq!((each, single), (expected, expected), "{level:?}");

@@ -15,11 +15,11 @@ use fearless_simd::{f32x16, mask32x16};
 use fearless_simd_macros::simd;
 
 use super::functions::{exp, ln, sigmoid};
+use super::gaussian_lanes::{Matrix, Vector, cross, dot, load_lanes, splat_matrix, splat_vector, transform};
 use super::harmonics::basis;
 use super::pixels::{LANES, Lanes, splat};
 use super::posed::PosedView;
 use super::rotation::Rotation;
-use super::vectors::{Matrix, Vector, cross, dot, load_lanes, splat_matrix, splat_vector, transform};
 use crate::constants::{JACOBIAN_MARGIN, LOG_SCALE_RANGE, MAX_COVARIANCE, MIN_ALPHA, MIN_ANTIALIASING};
 use crate::{Blending, OccupancySource, RenderSettings};
 

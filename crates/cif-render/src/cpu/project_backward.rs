@@ -6,10 +6,10 @@ use cif_geometry::spherical_harmonics::COEFFICIENTS;
 use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
 
+use super::gaussian_lanes::{cross, dot, load_lanes, scaled, splat_matrix, store_lanes, transform_back};
 use super::harmonics::{basis, basis_backward};
 use super::pixels::{LANES, Lanes, splat};
 use super::project::{Footprint, Posed, SH_BLOCK, Splat, ViewConstants, load_sh, sh_blocks};
-use super::vectors::{cross, dot, load_lanes, scaled, splat_matrix, store_lanes, transform_back};
 use crate::OccupancySource;
 use crate::constants::MAX_POSITION_GRADIENT;
 
@@ -52,14 +52,14 @@ impl SplatGradient {
 }
 
 /// Sixteen Gaussians with what is known of the loss by their splats.
-pub(super) struct Seen<'a> {
+pub(super) struct DrawnGaussians<'a> {
     /// Raw parameters in the order of [`super::posed::PosedView::row`].
     pub(super) posed: [Lanes; LANES],
     pub(super) sh: [&'a [f32; SH_FLOATS]; LANES],
     pub(super) gradients: [Lanes; LANES],
 }
 
-impl<'a> Seen<'a> {
+impl<'a> DrawnGaussians<'a> {
     /// Lanes that nothing is known of, all with these coefficients.
     pub(super) fn new(sh: &'a [f32; SH_FLOATS]) -> Self {
         Self { posed: [[0.0; LANES]; LANES], sh: [sh; LANES], gradients: [[0.0; LANES]; LANES] }
@@ -122,12 +122,16 @@ impl PosedGradients {
 
 /// Carries gradients of splats to the raw parameters. All lanes must have been drawn, or be without gradient.
 #[simd]
-pub(super) fn project_backward<S: Simd>(simd: S, view: &ViewConstants, seen: &Seen<'_>) -> PosedGradients {
+pub(super) fn project_backward<S: Simd>(
+    simd: S,
+    view: &ViewConstants,
+    drawn: &DrawnGaussians<'_>,
+) -> PosedGradients {
     let (zero, one) = (splat(simd, 0.0), splat(simd, 1.0));
-    let f = Footprint::new(simd, view, &Posed::load(simd, &seen.posed));
-    let v = load_lanes(simd, &seen.gradients);
-    let (v_image, responsibility) = ([v[0], v[1]], v[9]);
-    let (opacity, occupancy) = (v[13], v[14]);
+    let f = Footprint::new(simd, view, &Posed::load(simd, &drawn.posed));
+    let gradients = load_lanes(simd, &drawn.gradients);
+    let [v_x, v_y, m00, m01, m11, v_red, v_green, v_blue, ..] = gradients;
+    let [.., v_drawn_opacity, responsibility, red, green, blue, opacity, occupancy, _] = gradients;
 
     // Step 1: v_T = -L^T M W with W = L T, whose first row is L00 (t0 - C01 / C11 t1): the difference is
     // (low_pass t0 + t1 x (t0 x t1)) / C11, in which nothing cancels for needles.
@@ -144,15 +148,15 @@ pub(super) fn project_backward<S: Simd>(simd: S, view: &ViewConstants, seen: &Se
     let w1 = scaled(t1, l11);
     // With opacity as occupancy, -q / o is the instance loss by the blended opacity (dl / d log pi = -q).
     let v_blended = match view.occupancy {
-        Some(OccupancySource::Opacity) => v[8] - responsibility / opacity,
-        _ => v[8],
+        Some(OccupancySource::Opacity) => v_drawn_opacity - responsibility / opacity,
+        _ => v_drawn_opacity,
     };
     let v_opacity = v_blended * f.compensation;
     // Step 2: d log rho / dT is C0^-1 T - C^-1 T, and C^-1 T = L^T W.
     let floored = f.compensation_floored;
     let slope = floored.select(zero, v_blended * f.base_opacity * f.compensation);
     let inverse = floored.select(zero, slope / f.sharp_determinant);
-    let m = [v[2] + slope, v[3], v[4] + slope];
+    let m = [m00 + slope, m01, m11 + slope];
     let mut v_t0 = scaled(turned, inverse);
     let mut v_t1 = scaled(cross(f.normal, t0), inverse);
 
@@ -174,7 +178,7 @@ pub(super) fn project_backward<S: Simd>(simd: S, view: &ViewConstants, seen: &Se
     let [x, y, _] = f.in_camera;
     let r = f.inverse_depth;
     let (fx, fy) = (r * view.focal[0], r * view.focal[1]);
-    let mut v_point = [fx * v_image[0], fy * v_image[1], -((fx * x * v_image[0] + fy * y * v_image[1]) * r)];
+    let mut v_point = [fx * v_x, fy * v_y, -((fx * x * v_x + fy * y * v_y) * r)];
     v_point[2] -= (fx * dot(v_t0, spread[0]) + fy * dot(v_t1, spread[1])) * r;
     let v_last = [dot(v_t0, spread[2]), dot(v_t1, spread[2])];
     for (axis, focal) in [fx, fy].into_iter().enumerate() {
@@ -201,17 +205,18 @@ pub(super) fn project_backward<S: Simd>(simd: S, view: &ViewConstants, seen: &Se
     let v_quaternion = f.rotation.backward(simd, &v_rotation);
 
     // Step 9: colour.
-    let mut v_color = [v[5], v[6], v[7]];
-    for channel in 0..3 {
-        v_color[channel] = v[10 + channel].simd_gt(zero).select(v_color[channel], zero);
-    }
+    let v_color = [
+        red.simd_gt(zero).select(v_red, zero),
+        green.simd_gt(zero).select(v_green, zero),
+        blue.simd_gt(zero).select(v_blue, zero),
+    ];
     let degree = view.sh_degree;
     let values = basis(simd, f.direction, degree);
     let mut along = [zero; COEFFICIENTS];
     let blocks = sh_blocks(degree);
     let mut v_sh = [[[0.0; LANES]; LANES]; SH_FLOATS / SH_BLOCK];
     for block in 0..blocks {
-        let sh = load_sh(simd, &seen.sh, block);
+        let sh = load_sh(simd, &drawn.sh, block);
         let mut v_block = [zero; SH_BLOCK];
         for k in 0..SH_BLOCK {
             let at = block * SH_BLOCK + k;

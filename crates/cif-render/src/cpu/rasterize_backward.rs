@@ -208,7 +208,8 @@ impl<S: Simd> Seen<S> {
     }
 }
 
-/// Writes one gradient per entry, given where the forward pass met it; `label_mass` gets `[entries, labels]` weighted responsibilities.
+/// Writes one gradient per entry, given where the forward pass met it; `label_mass` gets `[entries, labels]` weighted
+/// responsibilities.
 #[simd]
 pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
     simd: S,

@@ -4,8 +4,8 @@
 use fearless_simd::prelude::*;
 use fearless_simd::{f32x16, mask32x16};
 
+use super::gaussian_lanes::Matrix;
 use super::pixels::splat;
-use super::vectors::Matrix;
 
 /// A raw quaternion of each lane, and what normalises it.
 #[derive(Clone, Copy)]
@@ -69,7 +69,7 @@ mod tests {
     use fearless_simd::dispatch;
 
     use super::super::SimdLevel;
-    use super::super::vectors::splat_matrix;
+    use super::super::gaussian_lanes::splat_matrix;
     use super::*;
 
     #[test]
@@ -78,7 +78,7 @@ mod tests {
         let v = [[0.3_f32, -1.0, 0.2], [0.7, 0.1, -0.4], [0.9, -0.6, 0.5]];
         let expected = quaternion::to_rotation(quaternion::try_normalize(raw).unwrap());
         let expected_back = quaternion::to_rotation_backward(raw, v);
-        for level in SimdLevel::available().into_iter().filter_map(SimdLevel::level) {
+        for level in SimdLevel::levels() {
             let (matrix, back) = dispatch!(level, simd => {
                 let (rotation, _) = Rotation::new(simd, raw.map(|value| splat(simd, value)));
                 let matrix = rotation.matrix(simd).map(|row| row.map(|v| v.to_array()[7]));
@@ -93,7 +93,7 @@ mod tests {
 
     #[test]
     fn what_has_no_rotation_is_left_out() {
-        for level in SimdLevel::available().into_iter().filter_map(SimdLevel::level) {
+        for level in SimdLevel::levels() {
             for (raw, expected) in
                 [([0.0; 4], 0), ([f32::NAN, 0.0, 0.0, 1.0], 0), ([1e-3, 0.0, 0.0, 0.0], 0xffff)]
             {

@@ -116,6 +116,12 @@ impl TilePlace {
         (x < self.width && y < self.height).then(|| y as usize * self.width as usize + x as usize)
     }
 
+    /// From the first pixel's centre to the mean of a splat, pixels.
+    #[inline(always)]
+    fn to_mean(&self, s: &Splat) -> [f32; 2] {
+        [s.mean[0] - (self.x as f32 + 0.5), s.mean[1] - (self.y as f32 + 0.5)]
+    }
+
     /// Transmittance at the start: 1 inside the image, -1 outside.
     pub(super) fn initial_transmittance(&self) -> TilePixels {
         std::array::from_fn(|group| {
@@ -198,8 +204,7 @@ pub(super) fn prepare<S: Simd>(
     place: &TilePlace,
     wanted: [Groups; 2],
 ) -> Option<SplatInTile<S>> {
-    let first = s.mean[0] - (place.x as f32 + 0.5);
-    let first_dy = s.mean[1] - (place.y as f32 + 0.5);
+    let [first, first_dy] = place.to_mean(s);
     let groups = touched(simd, s, first, first_dy, wanted);
     if groups[0].union(groups[1]).is_empty() {
         return None;
@@ -239,8 +244,7 @@ impl<S: Simd> SplatInTile<S> {
     /// A splat that touches these groups.
     #[inline(always)]
     pub(super) fn new(simd: S, s: &Splat, place: &TilePlace, groups: [Groups; 2]) -> Self {
-        let first = s.mean[0] - (place.x as f32 + 0.5);
-        let first_dy = s.mean[1] - (place.y as f32 + 0.5);
+        let [first, first_dy] = place.to_mean(s);
         let [l00, l01, l11] = s.binary_factor();
         let (l00, l01, l11) = (splat(simd, l00), splat(simd, l01), splat(simd, l11));
         let columns = load(simd, &LANE_COLUMNS);

@@ -62,8 +62,8 @@ struct Vector([f32; LANES]);
 
 /// Normalised taps from the centre outwards.
 pub(crate) fn window() -> [f32; RADIUS + 1] {
-    static TAPS: OnceLock<[f32; RADIUS + 1]> = OnceLock::new();
-    *TAPS.get_or_init(|| {
+    static WINDOW: OnceLock<[f32; RADIUS + 1]> = OnceLock::new();
+    *WINDOW.get_or_init(|| {
         let tap = |k: usize| (-(k as f64 * k as f64) / (2.0 * SIGMA * SIGMA)).exp();
         let sum = tap(0) + 2.0 * (1..=RADIUS).map(tap).sum::<f64>();
         std::array::from_fn(|k| (tap(k) / sum) as f32)

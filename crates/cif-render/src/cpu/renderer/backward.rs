@@ -12,7 +12,7 @@ use super::super::labels::{IdentityRows, TileLabels};
 use super::super::pixels::LANES;
 use super::super::posed::PosedView;
 use super::super::project::ViewConstants;
-use super::super::project_backward::{PosedGradient, Seen, SplatGradient, project_backward};
+use super::super::project_backward::{DrawnGaussians, PosedGradient, SplatGradient, project_backward};
 use super::super::rasterize::TileImage;
 use super::super::rasterize_backward::{TileCotangents, TileInstances, rasterize_tile_backward};
 use super::super::tile::{GROUPS, TilePixels, TilePlace};
@@ -287,12 +287,12 @@ impl Renderer {
                     }
                 }
                 for found in found.chunks(LANES) {
-                    let mut seen = Seen::new(posed.sh(found[0].1.gaussian as usize));
+                    let mut drawn = DrawnGaussians::new(posed.sh(found[0].1.gaussian as usize));
                     for (lane, (_, splat, v)) in found.iter().enumerate() {
                         let gaussian = splat.gaussian as usize;
-                        seen.set(lane, (posed.row(gaussian), posed.sh(gaussian)), splat, v);
+                        drawn.set(lane, (posed.row(gaussian), posed.sh(gaussian)), splat, v);
                     }
-                    let posed_gradients = dispatch!(level, simd => project_backward(simd, view, &seen));
+                    let posed_gradients = dispatch!(level, simd => project_backward(simd, view, &drawn));
                     for (lane, (row, splat, v)) in found.iter().enumerate() {
                         let (row, gaussian) = (*row, splat.gaussian as usize);
                         let sh = if moves_sh && has_posed_sh(field, gaussian) {

@@ -98,7 +98,7 @@ mod tests {
     fn lanes_become_vectors_and_come_back() {
         let lanes: [Lanes; LANES] =
             std::array::from_fn(|lane| std::array::from_fn(|value| (16 * lane + value) as f32));
-        for level in SimdLevel::available().into_iter().filter_map(SimdLevel::level) {
+        for level in SimdLevel::levels() {
             let vectors = dispatch!(level, simd => load_lanes(simd, &lanes).map(|v| v.to_array()));
             for (value, vector) in vectors.iter().enumerate() {
                 for (lane, found) in vector.iter().enumerate() {
