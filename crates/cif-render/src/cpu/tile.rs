@@ -118,7 +118,7 @@ impl TilePlace {
 
     /// From the first pixel's centre to the mean of a splat, pixels.
     #[inline(always)]
-    fn to_mean(&self, s: &Splat) -> [f32; 2] {
+    fn offset_of(&self, s: &Splat) -> [f32; 2] {
         [s.mean[0] - (self.x as f32 + 0.5), s.mean[1] - (self.y as f32 + 0.5)]
     }
 
@@ -204,7 +204,7 @@ pub(super) fn prepare<S: Simd>(
     place: &TilePlace,
     wanted: [Groups; 2],
 ) -> Option<SplatInTile<S>> {
-    let [first, first_dy] = place.to_mean(s);
+    let [first, first_dy] = place.offset_of(s);
     let groups = touched(simd, s, first, first_dy, wanted);
     if groups[0].union(groups[1]).is_empty() {
         return None;
@@ -244,7 +244,7 @@ impl<S: Simd> SplatInTile<S> {
     /// A splat that touches these groups.
     #[inline(always)]
     pub(super) fn new(simd: S, s: &Splat, place: &TilePlace, groups: [Groups; 2]) -> Self {
-        let [first, first_dy] = place.to_mean(s);
+        let [first, first_dy] = place.offset_of(s);
         let [l00, l01, l11] = s.binary_factor();
         let (l00, l01, l11) = (splat(simd, l00), splat(simd, l01), splat(simd, l11));
         let columns = load(simd, &LANE_COLUMNS);
