@@ -37,6 +37,8 @@ pub(crate) enum Purpose {
     HeadRearrangements = 15,
     /// Cameras between views.
     HeadCameras = 16,
+    /// Views that changes of the set of Gaussians are decided by.
+    Contributions = 17,
 }
 
 /// The stream of a purpose; `counter` tells its uses apart.

@@ -260,6 +260,24 @@ impl Moment<'_> {
         self.is_of_colors() && self.iteration < self.config.densify.until
     }
 
+    /// Additions, with the one behind this step, in which the set is to become full (`densify.full_at`): those of this
+    /// stage, and of the fine stage where that is to come.
+    pub(crate) fn additions_left(&self) -> u32 {
+        let densify = &self.config.densify;
+        let full_at = |stage: Stage| {
+            let steps = self.facts.stages.iterations(self.config, stage).min(densify.until);
+            (f64::from(densify.full_at) * f64::from(steps)) as u32
+        };
+        let between = |from: u32, to: u32| (to / densify.every).saturating_sub(from / densify.every);
+        let left = between(self.iteration, full_at(self.stage)) + 1;
+        match self.stage {
+            Stage::Coarse if self.facts.stages.is_dynamic => {
+                left + between(densify.from, full_at(Stage::Fine))
+            }
+            _ => left,
+        }
+    }
+
     fn is_warm(&self) -> bool {
         self.densifies() && self.iteration > self.config.densify.from
     }
@@ -476,6 +494,23 @@ mod tests {
         config.effects.still_from = 0.25;
         let held_out = falling(&config, colors, Stage::Fine, Due::HoldOut);
         assert_eq!(held_out, (1..=150).collect::<Vec<_>>(), "up to the last test");
+    }
+
+    #[test]
+    fn a_set_becomes_full_at_a_share_of_the_steps_with_additions() {
+        let mut config = quiet();
+        let densify = &mut config.densify;
+        (densify.from, densify.until, densify.every, densify.full_at) = (10, 100, 10, 0.5);
+        let left = |stages: Stages, stage: Stage, iteration: u32| {
+            let facts = Facts { stages, ..FACTS };
+            Moment { config: &config, stage, iteration, total: 0, facts }.additions_left()
+        };
+        // Additions of a stage fall on 20, 30, ..., 90; the set is full behind that on 50.
+        let of_fine = [20, 30, 40, 50, 60, 90].map(|step| left(FACTS.stages, Stage::Fine, step));
+        assert_eq!(of_fine, [4, 3, 2, 1, 1, 1]);
+        // Before them, those of the coarse stage.
+        let of_coarse = [20, 50, 90].map(|step| left(FACTS.stages, Stage::Coarse, step));
+        assert_eq!(of_coarse, [8, 5, 5]);
     }
 
     #[test]

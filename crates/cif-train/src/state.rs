@@ -121,11 +121,16 @@ impl State {
 
     /// The picture that the camera of a frame records of a rendered one.
     pub(crate) fn recorded(&self, index: usize, mut rendered: RenderedImage) -> RenderedImage {
+        self.record_color(index, &mut rendered.color);
+        rendered
+    }
+
+    /// Makes a rendered color that which the camera of a frame records of it.
+    pub(crate) fn record_color(&self, index: usize, color: &mut PixelGrid<[f32; 3]>) {
         if let Some(exposures) = &self.progress.exposures {
             let frame = &self.dataset.frames[index];
-            exposures.at(&frame.camera_name, frame.time).apply(&mut rendered.color);
+            exposures.at(&frame.camera_name, frame.time).apply(color);
         }
-        rendered
     }
 
     /// Adds the labelled pixels of a frame that identities are estimated from.

@@ -14,8 +14,8 @@ use cif_field::{Heads, SortMetric, TimeEncoding};
 use serde::{Deserialize, Serialize};
 
 pub use options::{
-    Ablation, Excess, HeadName, InstanceGeometry, LabelShares, Normalisation, ObjectMotion, OccupancyStart,
-    Preset, ScaleCorrection, WeakSet, Weakness,
+    Ablation, DensifyRule, Excess, HeadName, InstanceGeometry, LabelShares, Normalisation, ObjectMotion,
+    OccupancyStart, Preset, ScaleCorrection, WeakSet, Weakness,
 };
 pub use validate::ConfigError;
 
@@ -225,6 +225,14 @@ pub struct MotionConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DensifyConfig {
+    /// What decides which Gaussians are added and removed, default `error`.
+    pub rule: DensifyRule,
+    /// By `error`: training views that each addition looks at, default 8.
+    pub views: u32,
+    /// By `error`: share of the steps up to `until` over which the set grows to `max_gaussians`, default 0.5.
+    pub full_at: f32,
+    /// By `error`: share of a full set that each addition replaces, default 0.1.
+    pub turnover: f32,
     /// First step after which Gaussians are added, default 300.
     pub from: u32,
     /// Statistics are kept and Gaussians added before this step, default 4000; 0 never.

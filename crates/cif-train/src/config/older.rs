@@ -10,11 +10,12 @@ fn removed() -> [(&'static str, Value); 2] {
 }
 
 /// Settings that there were not, with the value that runs went by.
-fn added() -> [(&'static str, Value); 3] {
+fn added() -> [(&'static str, Value); 4] {
     [
         ("/resample/weakness", "occupancy".into()),
         ("/model/triangulate", false.into()),
         ("/identity/share_rounds", 0.into()),
+        ("/densify/rule", "gradient".into()),
     ]
 }
 
@@ -51,7 +52,7 @@ impl TrainConfig {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Weakness;
+    use super::super::{DensifyRule, Weakness};
     use super::*;
 
     #[test]
@@ -63,7 +64,12 @@ mod tests {
         json["adam"]["fresh_row_bias_correction"] = false.into();
         assert_eq!(TrainConfig::recorded(json.clone()).unwrap(), config);
         json["resample"].as_object_mut().unwrap().remove("weakness");
-        assert_eq!(TrainConfig::recorded(json.clone()).unwrap().resample.weakness, Weakness::Occupancy);
+        json["densify"].as_object_mut().unwrap().remove("rule");
+        let former = TrainConfig::recorded(json.clone()).unwrap();
+        assert_eq!(
+            (former.resample.weakness, former.densify.rule),
+            (Weakness::Occupancy, DensifyRule::Gradient)
+        );
         json["stages"]["tile_share"] = 0.5.into();
         let error = TrainConfig::recorded(json).unwrap_err();
         assert!(error.contains("stages.tile_share = 0.5"), "{error}");

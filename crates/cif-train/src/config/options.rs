@@ -16,6 +16,17 @@ pub enum Preset {
     Paper,
 }
 
+/// How Gaussians are added and removed while colours are learnt.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum DensifyRule {
+    /// Cloned and split where screen gradients are large, as in 3DGS.
+    Gradient,
+    /// Split where training views show the largest errors; those that show least make room.
+    #[default]
+    Error,
+}
+
 /// An ablation of the method (methods reference 8.7).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]

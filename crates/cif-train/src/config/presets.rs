@@ -81,6 +81,7 @@ fn paper(layout: Layout) -> TrainConfig {
         ..config.loss
     };
     config.densify = DensifyConfig {
+        rule: super::DensifyRule::Gradient,
         from: 500,
         until: 15_000,
         every: 100,
@@ -261,6 +262,10 @@ impl Default for MotionConfig {
 impl Default for DensifyConfig {
     fn default() -> Self {
         Self {
+            rule: super::DensifyRule::Error,
+            views: 8,
+            full_at: 0.5,
+            turnover: 0.1,
             from: 300,
             until: 4_000,
             every: 100,

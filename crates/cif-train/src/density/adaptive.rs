@@ -84,22 +84,33 @@ pub fn add_gaussians(
 /// plane.
 pub(crate) const FEWEST_OF_OBJECT: usize = 4;
 
-/// Removes transparent Gaussians and, once opacities were reset, those too large on screen or in space, but not the
-/// last ones of an object. `None` when none goes.
+/// Removes what [`is_useless`], but not the last ones of an object. `None` when none goes.
 #[must_use]
 pub fn prune(rows: &Rows<'_>, config: &DensifyConfig) -> Option<Rearrangement> {
+    remove(rows, config, &|row| is_useless(rows, config, row))
+}
+
+/// True of transparent Gaussians and, once opacities were reset, of those too large on screen or in space; of none in
+/// a set of `prune_min_n` or fewer.
+pub(super) fn is_useless(rows: &Rows<'_>, config: &DensifyConfig, row: usize) -> bool {
     let Rows { gaussians, statistics, extent, opacities_were_reset, .. } = *rows;
-    let n = gaussians.len();
-    if n <= config.prune_min_n as usize {
-        return None;
-    }
-    let goes = |row: usize| {
-        sigmoid(gaussians.opacity_logits[row]) < config.prune_opacity
-            || (opacities_were_reset
-                && (statistics.radius[row] > config.prune_radius_px
-                    || largest_scale(gaussians, row) > config.prune_scale * extent))
+    let is_transparent = || sigmoid(gaussians.opacity_logits[row]) < config.prune_opacity;
+    let is_too_large = || {
+        statistics.radius[row] > config.prune_radius_px
+            || largest_scale(gaussians, row) > config.prune_scale * extent
     };
-    let last = last_of_objects(rows, &goes);
+    gaussians.len() > config.prune_min_n as usize
+        && (is_transparent() || (opacities_were_reset && is_too_large()))
+}
+
+/// Removes rows, but not the last ones of an object. `None` when none goes.
+pub(super) fn remove(
+    rows: &Rows<'_>,
+    config: &DensifyConfig,
+    goes: &impl Fn(usize) -> bool,
+) -> Option<Rearrangement> {
+    let (gaussians, n) = (rows.gaussians, rows.gaussians.len());
+    let last = last_of_objects(rows, goes);
     let kept: Vec<u32> = (0..n as u32).filter(|row| !goes(*row as usize) || last.contains(row)).collect();
     let mut change = keep(gaussians, kept)?;
     // Drawn as faintly as anything may be.

@@ -3,6 +3,7 @@
 use cif_field::Gaussians;
 use rand_pcg::Pcg64;
 
+use super::contributions::Contributions;
 use super::rearrangement::Rearrangement;
 use super::statistics::DensifyStatistics;
 use crate::schedule::Moment;
@@ -14,6 +15,8 @@ pub struct Rows<'a> {
     pub gaussians: &'a Gaussians,
     /// What steps counted of every row since the set last grew.
     pub statistics: &'a DensifyStatistics,
+    /// Contributions of every row to the views that the strategy asked for; `None` where it asked for none.
+    pub contributions: Option<&'a Contributions>,
     /// Object that every row was made for, from 1 on; 0 for one that was made for none.
     pub made_for: &'a [u32],
     /// Extent of the scene, metres.
@@ -39,6 +42,11 @@ pub struct Change {
 pub trait Strategy: Send + Sync {
     /// True when a step adds to [`DensifyStatistics`].
     fn counts_statistics(&self, step: &Moment<'_>) -> bool;
+
+    /// Number of training views that changes behind a step look at.
+    fn views(&self, _step: &Moment<'_>) -> usize {
+        0
+    }
 
     /// Number of changes behind a step; 0 where none falls there.
     fn changes(&self, step: &Moment<'_>) -> usize;

@@ -81,6 +81,7 @@ fn pruning_needs_enough_gaussians_and_large_ones_go_only_after_a_reset() {
     let rows = |opacities_were_reset: bool| Rows {
         gaussians: &gaussians,
         statistics: &statistics,
+        contributions: None,
         made_for: &[0; 4],
         extent: EXTENT,
         opacities_were_reset,
@@ -102,6 +103,7 @@ fn the_last_of_an_object_stay_and_are_drawn() {
         let rows = Rows {
             gaussians: &gaussians,
             statistics: &statistics,
+            contributions: None,
             made_for,
             extent: EXTENT,
             opacities_were_reset: false,

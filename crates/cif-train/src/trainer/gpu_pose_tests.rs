@@ -1,5 +1,7 @@
 //! Groups that move as a whole, on a GPU beside the processor. `CIF_TEST_GPU=off|auto|require`.
 
+use std::sync::Arc;
+
 use cif_field::tracks::{NO_GROUP, TrackGroup, TrackPose};
 use cif_field::{Joint, JointKind, RotationEvidence, Tracks};
 use cif_render::Gradients;
@@ -9,6 +11,7 @@ use tempfile::TempDir;
 
 use super::Trainer;
 use super::gpu_tests::{assert_alike, device, drawn, on_processor, state, step, trainer_with};
+use crate::density::adaptive::Adaptive;
 use crate::engine::Changed;
 use crate::events::TrainEvent;
 use crate::poses::PoseMoments;
@@ -163,6 +166,7 @@ fn rows_of_groups_that_stay_on_the_device_end_as_those_that_the_host_rearranges(
     let run = |fetches: bool| {
         let (mut trainer, _folder) = trainer(Some(&gpu));
         trainer.state.config.stages.fine = 8;
+        trainer.set_density(Arc::new(Adaptive));
         let densify = &mut trainer.state.config.densify;
         (densify.from, densify.every, densify.gradient_threshold, densify.until) = (1, 3, 1e-7, 100);
         let (mut gaussians, mut relocated) = (Vec::new(), 0);

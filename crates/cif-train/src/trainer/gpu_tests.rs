@@ -1,5 +1,7 @@
 //! Steps on a GPU that go wrong, or that have no room, on a real capture. `CIF_TEST_GPU=off|auto|require`.
 
+use std::sync::Arc;
+
 use cif_field::Field;
 use cif_field::parameters::OPACITY_LOGITS;
 use cif_render::wgpu::{Gpu, GpuError, testing};
@@ -11,6 +13,7 @@ use super::guard_tests::support::{Scene, capture, small_config};
 use crate::clock::{Clock, Seconds};
 use crate::config::TrainConfig;
 use crate::density::DensifyStatistics;
+use crate::density::adaptive::Adaptive;
 use crate::engine::Views;
 use crate::engine::gpu::GpuEngine;
 use crate::engine::processor::Processor;
@@ -220,6 +223,7 @@ fn rows_that_stay_on_the_device_end_as_those_that_the_host_rearranges() {
         let mut sizes: Vec<f32> =
             trainer.state.field.gaussians.log_scales.iter().map(|s| s[0].max(s[1]).max(s[2]).exp()).collect();
         sizes.sort_by(f32::total_cmp);
+        trainer.set_density(Arc::new(Adaptive));
         let densify = &mut trainer.state.config.densify;
         (densify.from, densify.every, densify.prune_every, densify.opacity_reset_every) = (1, 3, 2, 5);
         (densify.gradient_threshold, densify.prune_min_n, densify.until) = (1e-7, 1, 100);
@@ -300,6 +304,7 @@ fn a_device_lost_after_a_change_of_the_set_leaves_what_was_fetched_before_it() {
     let Some(_) = testing::gpu() else { return };
     let gpu = Gpu::open().unwrap();
     let (mut trainer, _folder) = trainer(Some(&gpu));
+    trainer.set_density(Arc::new(Adaptive));
     let densify = &mut trainer.state.config.densify;
     (densify.from, densify.every, densify.gradient_threshold, densify.until) = (1, 3, 1e-7, 100);
     step(&mut trainer).0.unwrap();

@@ -29,6 +29,7 @@
 
 mod backend;
 mod contradicted;
+mod contributions;
 mod eta;
 mod evaluate;
 mod from_scene;
@@ -85,8 +86,7 @@ use self::saving::Saving;
 use crate::clock::{Clock, Seconds};
 use crate::config::{HeadName, TrainConfig};
 use crate::curve::Curve;
-use crate::density::adaptive::Adaptive;
-use crate::density::{DensifyStatistics, Strategy};
+use crate::density::{self, DensifyStatistics, Strategy};
 use crate::effects::changes::Changes;
 use crate::effects::{self, Effect};
 use crate::engine::Engine;
@@ -269,7 +269,7 @@ impl Trainer {
         let simd = SimdLevel::Auto;
         Ok(Self {
             stages: Stages { is_dynamic: config.effects.motion && dataset.times.len() > 1, has_instances },
-            density: Arc::new(Adaptive),
+            density: density::of(config.densify.rule),
             effects: effects::all(),
             engine: Box::new(Processor::new(simd)),
             simd,

@@ -189,7 +189,8 @@ impl Trainer {
         let falls = |what: Due| due.contains(&what);
         let effects = self.effects_at(Place::Behind, &self.done());
         let judges = effects.iter().any(|(_, due)| *due);
-        if judges || falls(Due::EstimateIdentities) || self.engine.is_far_ahead() {
+        let looks = self.done().is_of_colors() && self.density.views(&self.done()) > 0;
+        if judges || looks || falls(Due::EstimateIdentities) || self.engine.is_far_ahead() {
             self.fetch()?;
         }
         if self.state.progress.after_step == Some(AfterStep::Changes) {
@@ -261,11 +262,14 @@ impl Trainer {
         let strategy = Arc::clone(&self.density);
         let mut rng = stream(self.state.config.seed, Purpose::Split, self.state.progress.total_steps);
         let (mut cloned, mut split, mut pruned, mut capped) = (0, 0, 0, false);
+        let views = strategy.views(&self.done());
+        let mut contributions = if views > 0 { Some(self.contributions(views)?) } else { None };
         for k in 0..strategy.changes(&self.done()) {
             let state = &self.state;
             let rows = Rows {
                 gaussians: &state.field.gaussians,
                 statistics: &state.statistics,
+                contributions: contributions.as_ref(),
                 made_for: &state.made_for(),
                 extent: state.field.extent,
                 opacities_were_reset: state.progress.opacities_were_reset,
@@ -278,6 +282,7 @@ impl Trainer {
                 }
                 (cloned, split, pruned) =
                     (cloned + change.cloned, split + change.split, pruned + change.pruned);
+                contributions = contributions.map(|before| before.gather(&change.origins));
                 self.rearrange(change);
             }
             if restarts_statistics {

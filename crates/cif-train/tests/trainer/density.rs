@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use crate::support::{Scene, capture, small_config};
+use crate::effects::score;
+use crate::support::{Scene, capture, small_config, train};
+use cif_train::config::DensifyRule;
 use cif_train::density::{Change, Rows, Strategy, keep, with_copies};
 use cif_train::schedule::Moment;
 use cif_train::{Control, Outcome, Stage, TrainConfig, TrainEvent, Trainer};
@@ -99,4 +101,62 @@ fn a_strategy_that_is_declared_here_changes_the_set_on_its_steps_alone() {
     resumed.set_density(Arc::new(DoubleThenThin));
     run(&mut resumed, None);
     assert_eq!(resumed.field().gaussians, trainer.field().gaussians);
+}
+
+#[test]
+fn a_set_grows_step_by_step_and_is_renewed_once_it_is_full() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 3, views: 3, ..Scene::default() });
+    let mut config = config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (1, 101, 0);
+    let densify = &mut config.densify;
+    (densify.from, densify.every, densify.prune_every, densify.until) = (0, 10, 0, 100);
+    let before = Trainer::new(dataset.clone(), config.clone()).unwrap().field().len();
+    let most = 2 * before;
+    config.densify.max_gaussians = most as u32;
+    let mut trainer = Trainer::new(dataset, config).unwrap();
+    let mut found = Vec::new();
+    trainer
+        .run(&mut |event, _| {
+            if let TrainEvent::Densified { iteration, cloned, split, pruned, gaussians, .. } = *event {
+                assert_eq!(cloned, 0);
+                found.push((iteration, split, pruned, gaussians));
+            }
+            Control::Continue
+        })
+        .unwrap();
+    let sizes: Vec<usize> = found.iter().map(|(.., gaussians)| *gaussians).collect();
+    // Full behind half of the steps with additions, by equal factors.
+    let grown: Vec<usize> =
+        (1..=5).map(|k| (before as f64 * 2_f64.powf(f64::from(k) / 5.0)).ceil() as usize).collect();
+    for (size, expected) in sizes.iter().zip(&grown) {
+        assert!(size.abs_diff(*expected) <= 5, "{sizes:?}, expected {grown:?}");
+    }
+    assert_eq!(sizes[4..], [most; 5], "{found:?}");
+    // A tenth of a full set makes room each time, and is made anew.
+    for (iteration, split, pruned, _) in &found[5..] {
+        assert_eq!((*split, *pruned), (most / 10, most / 10), "{iteration}: {found:?}");
+    }
+    trainer.field().validate().unwrap();
+}
+
+#[test]
+fn splitting_by_error_shows_more_with_as_many_gaussians() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 3, views: 4, ..Scene::default() });
+    let psnr = |rule: DensifyRule| {
+        let of_seed = |seed: u64| {
+            let mut config = small_config();
+            config.seed = seed;
+            (config.stages.coarse, config.stages.fine, config.stages.instance) = (50, 400, 0);
+            config.densify.rule = rule;
+            (config.densify.every, config.densify.until) = (20, 300);
+            let trainer = train(dataset.clone(), config.clone());
+            assert!(trainer.field().len() <= config.densify.max_gaussians as usize);
+            score(&trainer)
+        };
+        (0..3).map(of_seed).sum::<f64>() / 3.0
+    };
+    let [error, gradient] = [DensifyRule::Error, DensifyRule::Gradient].map(psnr);
+    assert!(error > gradient, "{error} dB by error, {gradient} dB by gradient");
 }

@@ -216,7 +216,7 @@ fn threads_do_not_change_what_stands_still() {
 }
 
 /// Mean PSNR on the held-out frames, dB.
-fn score(trainer: &Trainer) -> f64 {
+pub(crate) fn score(trainer: &Trainer) -> f64 {
     let field = trainer.field();
     let options = EvaluationOptions::held_out(field);
     let scores = evaluate::<EvaluationError>(field, trainer.dataset(), &options, |_| Ok(())).unwrap();

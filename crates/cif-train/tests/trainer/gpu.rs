@@ -377,6 +377,8 @@ fn a_lost_device_leaves_what_was_fetched_last() {
     let mut config = small_config();
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (15, 40, 0);
     (config.densify.from, config.densify.every, config.densify.prune_every) = (5, 10, 0);
+    // Changes by errors fetch the state.
+    config.densify.rule = cif_train::config::DensifyRule::Gradient;
     config.report.step_every = 1;
     let mut trainer = Trainer::new(dataset.clone(), config).unwrap();
     trainer.use_gpu(&gpu).unwrap();

@@ -1,0 +1,37 @@
+//! What Gaussians contribute to training views, and to what is wrong there.
+
+/// Contributions of every Gaussian to a few training views.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Contributions {
+    /// Blending weights over the pixels of the view that shows most of it, `max over views of sum w`, pixels: what few
+    /// views show counts as much as what all do.
+    pub weight: Vec<f32>,
+    /// Errors of the pixels of all views by the same weights, `sum w |rendered - image|`, pixels times the mean over
+    /// channels of values in [0, 1].
+    pub error: Vec<f32>,
+}
+
+impl Contributions {
+    /// No contribution of `n` Gaussians yet.
+    #[must_use]
+    pub fn zeros(n: usize) -> Self {
+        Self { weight: vec![0.0; n], error: vec![0.0; n] }
+    }
+
+    /// Adds a view: weight and error of every Gaussian there, `[N, 2]`.
+    pub fn add_view(&mut self, sums: &[f32]) {
+        for ((weight, error), sums) in self.weight.iter_mut().zip(&mut self.error).zip(sums.chunks_exact(2)) {
+            *weight = weight.max(sums[0]);
+            *error += sums[1];
+        }
+    }
+
+    /// Follows a change of the set: rows that stay keep what they contribute, of others nothing is known.
+    #[must_use]
+    pub fn gather(&self, origins: &[Option<u32>]) -> Self {
+        let pick = |values: &[f32]| {
+            origins.iter().map(|origin| origin.map_or(0.0, |row| values[row as usize])).collect()
+        };
+        Self { weight: pick(&self.weight), error: pick(&self.error) }
+    }
+}
