@@ -239,13 +239,13 @@ pub struct DensifyConfig {
     pub until: u32,
     /// Steps between additions, default 100.
     pub every: u32,
-    /// Mean screen gradient (normalised device coordinates) from which a Gaussian is cloned or split,
+    /// By `gradient`: mean screen gradient (normalised device coordinates) from which a Gaussian is cloned or split,
     /// default 2e-4.
     pub gradient_threshold: f32,
-    /// Largest scale, as a fraction of the extent, that is cloned rather than split, default 0.01.
+    /// By `gradient`: largest scale, as a fraction of the extent, that is cloned rather than split, default 0.01.
     pub split_scale: f32,
-    /// No additions beyond this many Gaussians, default 12 000; those with the largest gradient go first. What
-    /// travelling objects start with comes on top, see `motion.gaussians`.
+    /// No additions beyond this many Gaussians, default 12 000; those with the largest gradient or error go first. What
+    /// travelling objects start with comes on top, see `motion.gaussians`, until additions by `error` take it in.
     pub max_gaussians: u32,
     /// Steps between prunings, default 100; 0 never.
     pub prune_every: u32,

@@ -465,7 +465,7 @@ impl Trainer {
         self.restore_head()
     }
 
-    /// Adds and removes Gaussians by other rules than [`Adaptive`]. They are not saved with the run: one that is resumed
+    /// Adds and removes Gaussians by other rules than those that the settings name. They are not saved with the run: one that is resumed
     /// is to be given them again.
     pub fn set_density(&mut self, strategy: Arc<dyn Strategy>) {
         self.density = strategy;
