@@ -400,7 +400,8 @@ def test_recorded_cameras_and_comparisons(page: ShownPage, trained: cif.Field) -
         if where.any():
             # Canvases round colours, which they multiply by their opacity.
             assert np.abs(mask[where][:, :3] - np.array(node["color"])).max() <= 2
-            assert float(text.split()[0]) == pytest.approx(psnr(rendered, truth, where), abs=0.2)
+            # Objects are drawn 50 dB close to their renders: an error of 26 dB may differ by 20 lg(1 + 10^(-24 / 20)).
+            assert float(text.split()[0]) == pytest.approx(psnr(rendered, truth, where), abs=0.5)
     name = page.text("#view-name")
     assert name == f"{found['views'][index]['name']} (val)"
     page.press("next-view")
@@ -454,9 +455,9 @@ def test_edits_come_home(page: ShownPage, stage: Path, trained: cif.Field) -> No
     page.find("#edit-undo").click()
     page.press("hide", "frame", "brush")
     area = page.find("#picture").bounding_box()
-    page.mouse.move(area["x"] + 0.4 * area["width"], area["y"] + area["height"] / 2)
+    page.mouse.move(area["x"] + 0.3 * area["width"], area["y"] + area["height"] / 2)
     page.mouse.down()
-    page.mouse.move(area["x"] + 0.6 * area["width"], area["y"] + area["height"] / 2, steps=4)
+    page.mouse.move(area["x"] + 0.7 * area["width"], area["y"] + area["height"] / 2, steps=12)
     page.mouse.up()
     assert int(page.text("#edit-erased").split()[0]) >= 5 and page.text("#edits-count") == "3 objects changed"
     with page.page.expect_download() as download:

@@ -9,7 +9,7 @@ use rand_pcg::Pcg64;
 
 use super::adaptive::{is_useless, remove};
 use super::contributions::Contributions;
-use super::rearrangement::{Rearrangement, in_world};
+use super::rearrangement::{Rearrangement, in_world, twice};
 use super::strategy::{Change, Rows, Strategy};
 use crate::config::DensifyConfig;
 use crate::schedule::{Due, Moment};
@@ -116,18 +116,11 @@ fn split(
 
 /// Replaces Gaussians by their halves, which come last.
 fn halved(gaussians: &Gaussians, rows: &[u32]) -> Rearrangement {
-    let mut is_split = vec![false; gaussians.len()];
-    rows.iter().for_each(|row| is_split[*row as usize] = true);
-    let mut parents: Vec<u32> = (0..gaussians.len() as u32).filter(|row| !is_split[*row as usize]).collect();
-    let mut origins: Vec<Option<u32>> = parents.iter().copied().map(Some).collect();
-    let first = parents.len();
-    parents.extend(rows.iter().flat_map(|row| [*row, *row]));
-    origins.resize(parents.len(), None);
-    let mut set = gaussians.gather(&parents);
-    for (row, side) in (first..set.len()).zip([1.0, -1.0].into_iter().cycle()) {
-        make_half(&mut set, row, side);
+    let (mut change, first) = twice(gaussians, &[], rows);
+    for (row, side) in (first..change.gaussians.len()).zip([1.0, -1.0].into_iter().cycle()) {
+        make_half(&mut change.gaussians, row, side);
     }
-    Rearrangement { gaussians: set, origins, parents, cloned: 0, split: rows.len(), pruned: 0 }
+    change
 }
 
 /// Standard deviation of a half along the longest axis, and distance of its centre, in standard deviations of the

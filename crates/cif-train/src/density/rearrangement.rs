@@ -34,6 +34,22 @@ pub fn with_copies(
     splits: &[u32],
     rng: &mut impl Rng,
 ) -> Rearrangement {
+    let (mut change, first_child) = twice(gaussians, clones, splits);
+    let set = &mut change.gaussians;
+    for row in first_child..set.len() {
+        let xi = std::array::from_fn(|_| StandardNormal.sample(rng));
+        let offset = in_world(set, row, xi);
+        for axis in 0..3 {
+            set.means[row][axis] += offset[axis];
+            set.log_scales[row][axis] -= SPLIT_SHRINK.ln();
+        }
+    }
+    change
+}
+
+/// Duplicates some Gaussians, and replaces others by two copies side by side, which come last: from the row that is
+/// returned on.
+pub(super) fn twice(gaussians: &Gaussians, clones: &[u32], splits: &[u32]) -> (Rearrangement, usize) {
     let n = gaussians.len();
     let mut is_split = vec![false; n];
     for row in splits {
@@ -45,16 +61,15 @@ pub fn with_copies(
     let first_child = parents.len();
     parents.extend(splits.iter().flat_map(|row| [*row, *row]));
     origins.resize(parents.len(), None);
-    let mut set = gaussians.gather(&parents);
-    for row in first_child..set.len() {
-        let xi = std::array::from_fn(|_| StandardNormal.sample(rng));
-        let offset = in_world(&set, row, xi);
-        for axis in 0..3 {
-            set.means[row][axis] += offset[axis];
-            set.log_scales[row][axis] -= SPLIT_SHRINK.ln();
-        }
-    }
-    Rearrangement { gaussians: set, origins, parents, cloned: clones.len(), split: splits.len(), pruned: 0 }
+    let change = Rearrangement {
+        gaussians: gaussians.gather(&parents),
+        origins,
+        parents,
+        cloned: clones.len(),
+        split: splits.len(),
+        pruned: 0,
+    };
+    (change, first_child)
 }
 
 /// Removes all but some Gaussians; `None` where all stay.
