@@ -400,7 +400,7 @@ def test_recorded_cameras_and_comparisons(page: ShownPage, trained: cif.Field) -
         if where.any():
             # Canvases round colours, which they multiply by their opacity.
             assert np.abs(mask[where][:, :3] - np.array(node["color"])).max() <= 2
-            # Objects are drawn 50 dB close to their renders: an error of 26 dB may differ by 20 lg(1 + 10^(-24 / 20)).
+            # Drawn 50 dB close to its render, an error of 26 dB may differ by 20 lg(1 + 10^(-24 / 20)).
             assert float(text.split()[0]) == pytest.approx(psnr(rendered, truth, where), abs=0.5)
     name = page.text("#view-name")
     assert name == f"{found['views'][index]['name']} (val)"
