@@ -225,7 +225,7 @@ pub struct MotionConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DensifyConfig {
-    /// What decides which Gaussians are added and removed, default `error`.
+    /// Rule by which Gaussians are added and removed, default `error`.
     pub rule: DensifyRule,
     /// By `error`: training views that each addition looks at, default 8.
     pub views: u32,

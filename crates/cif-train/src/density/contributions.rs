@@ -1,6 +1,6 @@
-//! What Gaussians contribute to training views, and to what is wrong there.
+//! Contributions of Gaussians to training views, and to their errors.
 
-/// Contributions of every Gaussian to a few training views.
+/// Of every Gaussian, over a few training views.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Contributions {
     /// Blending weights over the pixels of the view that shows most of it, `max over views of sum w`, pixels: what few

@@ -18,7 +18,7 @@ use crate::schedule::{Due, Moment};
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ErrorGuided;
 
-/// What changes the set behind a step, in order.
+/// Parts of a change behind a step, in order.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Part {
     Remove,

@@ -1,4 +1,4 @@
-//! What Gaussians contribute to a few training views, for densification.
+//! Contributions of Gaussians to a few training views, for densification.
 
 use cif_render::cpu::Renderer;
 use cif_render::{BlendRequest, Blending};
