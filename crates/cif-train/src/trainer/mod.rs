@@ -465,8 +465,8 @@ impl Trainer {
         self.restore_head()
     }
 
-    /// Adds and removes Gaussians by other rules than those that the settings name. They are not saved with the run: one that is resumed
-    /// is to be given them again.
+    /// Adds and removes Gaussians by other rules than the settings name. They are not saved with the run: one that is
+    /// resumed is to be given them again.
     pub fn set_density(&mut self, strategy: Arc<dyn Strategy>) {
         self.density = strategy;
     }
