@@ -341,7 +341,7 @@ impl Decoding {
 }
 
 impl TrainFrame {
-    fn new(
+    pub(crate) fn new(
         image: PixelGrid<[u8; 3]>,
         labels: Option<PixelGrid<u16>>,
         features: Option<Arc<PixelGrid<[f32; 3]>>>,

@@ -63,6 +63,7 @@ pub mod fit;
 mod frames;
 mod guard;
 mod guidance;
+mod half_size;
 pub mod heads;
 pub mod losses;
 mod mask_edges;

@@ -2,6 +2,7 @@
 //! the steps. Source: methods reference 1.1 and 1.3.
 
 use crate::config::{Ablation, HeadName, TrainConfig};
+use crate::half_size;
 use crate::stage::Stage;
 
 /// `exp((1 - r) ln first + r ln last)` with `r = step / steps`, clamped to [0, 1].
@@ -110,6 +111,8 @@ impl Stages {
 /// Everything that falls on single steps of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Due {
+    /// The step sees images of half the width and height.
+    HalveImages,
     /// Before the step: the present degree of spherical harmonics is tried, as the next one is due.
     TryHarmonics,
     /// Before the step: degrees of spherical harmonics that do not help are taken back, for good.
@@ -151,7 +154,8 @@ struct Row {
 }
 
 /// What falls on which step. Source: methods reference 1.5 and 6 (changes of the set), 11 (effects).
-const TABLE: [Row; 16] = [
+const TABLE: [Row; 17] = [
+    Row { due: Due::HalveImages, falls: |at| at.sees_half_size() },
     Row {
         due: Due::TryHarmonics,
         falls: |at| at.judges_harmonics() && at.every(at.config.model.sh_interval),
@@ -275,6 +279,15 @@ impl Moment<'_> {
                 left + between(densify.from, full_at(Stage::Fine))
             }
             _ => left,
+        }
+    }
+
+    /// True of the first fine steps, and of coarse ones unless fits measure what these reconstruct.
+    fn sees_half_size(&self) -> bool {
+        match self.stage {
+            Stage::Coarse => self.config.stages.half_size > 0.0 && !self.facts.stages.are_guided(self.config),
+            Stage::Fine => self.iteration <= half_size::last_step(self.config, self.last_of_fine()),
+            _ => false,
         }
     }
 
@@ -414,7 +427,7 @@ mod tests {
     fn quiet() -> TrainConfig {
         let mut config = TrainConfig::default();
         (config.stages.coarse, config.stages.fine, config.stages.instance) = (200, 200, 200);
-        config.stages.fine_includes_coarse = false;
+        (config.stages.fine_includes_coarse, config.stages.half_size) = (false, 0.0);
         config.densify.until = 0;
         (config.identity.refresh_every, config.resample.every) = (0, 0);
         let effects = &mut config.effects;
@@ -494,6 +507,22 @@ mod tests {
         config.effects.still_from = 0.25;
         let held_out = falling(&config, colors, Stage::Fine, Due::HoldOut);
         assert_eq!(held_out, (1..=150).collect::<Vec<_>>(), "up to the last test");
+    }
+
+    #[test]
+    fn images_are_halved_on_the_first_fine_steps_and_on_coarse_ones_that_nothing_is_measured_in() {
+        let mut config = quiet();
+        let on = |config: &TrainConfig, facts, stage| falling(config, facts, stage, Due::HalveImages);
+        assert!(on(&config, FACTS, Stage::Fine).is_empty());
+        config.stages.half_size = 0.3;
+        assert_eq!(on(&config, FACTS, Stage::Fine), (1..=60).collect::<Vec<_>>());
+        assert!(
+            on(&config, FACTS, Stage::Coarse).is_empty() && on(&config, FACTS, Stage::Instance).is_empty()
+        );
+        let colors = Facts { stages: Stages { has_instances: false, ..FACTS.stages }, ..FACTS };
+        assert_eq!(on(&config, colors, Stage::Coarse).len(), 500, "on every step");
+        config.stages.half_size = 0.0;
+        assert!(on(&config, colors, Stage::Coarse).is_empty());
     }
 
     #[test]

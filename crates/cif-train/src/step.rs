@@ -20,7 +20,10 @@ use crate::stage::Stage;
 pub(crate) struct StepView {
     /// Index of its frame in the capture.
     pub index: usize,
+    /// Its image, whole or of half the size.
     pub frame: Arc<TrainFrame>,
+    /// Camera of that image.
+    pub camera: PinholeCamera,
     /// True when the pixels that effects are judged by train nothing.
     pub leaves_judged: bool,
 }

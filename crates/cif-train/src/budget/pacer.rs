@@ -10,6 +10,37 @@ pub const COARSE: f64 = 0.35;
 /// The same of an instance step: the instance pass on top.
 pub const INSTANCE: f64 = 1.25;
 
+/// First steps of a stage that cost less than its others.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Cheaper {
+    /// Share of the steps.
+    pub share: f64,
+    /// Cost of one, relative to the others.
+    pub cost: f64,
+}
+
+impl Cheaper {
+    /// Mean cost of all steps of the stage.
+    #[must_use]
+    pub fn mean(&self) -> f64 {
+        1.0 - self.share * (1.0 - self.cost)
+    }
+
+    /// Cost of the first `done` of so many steps.
+    #[must_use]
+    pub fn cost_up_to(&self, done: u32, steps: u32) -> f64 {
+        let cheaper = (self.share * f64::from(steps)).floor().min(f64::from(done));
+        f64::from(done) - cheaper * (1.0 - self.cost)
+    }
+
+    /// Steps of the stage where, after the first `done`, there is time for `more` that cost 1.
+    fn steps(&self, done: f64, more: f64) -> f64 {
+        let steps = (more + done * self.cost) / self.mean();
+        // No cheaper ones are left otherwise.
+        if done < self.share * steps { steps } else { done + more }
+    }
+}
+
 /// Share of the budget between two looks at what steps cost.
 const LOOK_EVERY: f64 = 0.01;
 
@@ -36,6 +67,8 @@ pub struct StageShare {
     pub stage: Stage,
     /// Expected time, any unit.
     pub weight: f64,
+    /// Its first steps, where these cost less.
+    pub cheaper: Cheaper,
 }
 
 /// Work to come that is no step of a stage.
@@ -47,18 +80,20 @@ pub struct OtherWork {
     pub has_fits: bool,
 }
 
-/// Weights of the stages for [`Pacer::enter`]: `steps` of each, in order.
+/// Weights of the stages for [`Pacer::enter`]: `steps` of each, in order, and which of them cost less.
 #[must_use]
-pub(crate) fn weights(steps: &[(Stage, u32)]) -> Vec<StageShare> {
+pub(crate) fn weights(steps: &[(Stage, u32, Cheaper)]) -> Vec<StageShare> {
     let cost = |stage| match stage {
         Stage::Coarse => COARSE,
         Stage::Instance => INSTANCE,
         _ => 1.0,
     };
-    steps
-        .iter()
-        .map(|(stage, steps)| StageShare { stage: *stage, weight: f64::from(*steps) * cost(*stage) })
-        .collect()
+    let share = |&(stage, steps, cheaper): &(Stage, u32, Cheaper)| StageShare {
+        stage,
+        weight: f64::from(steps) * cost(stage) * cheaper.mean(),
+        cheaper,
+    };
+    steps.iter().map(share).collect()
 }
 
 /// Follows a budget. Knows nothing of training: it is told the time and answers with steps.
@@ -69,7 +104,11 @@ pub struct Pacer {
     deadline: f64,
     /// Last look: time and step of the stage.
     look: (f64, u32),
-    /// Seconds per step of the present stage.
+    /// Cost of the steps since then, relative to the last ones of the stage.
+    since: f64,
+    /// First steps of the present stage that cost less.
+    cheaper: Cheaper,
+    /// Seconds per step of the present stage, of those that cost most.
     cost: Option<f64>,
 }
 
@@ -77,7 +116,8 @@ impl Pacer {
     /// Paces a run that has used nothing, or a part of its budget.
     #[must_use]
     pub fn new(budget: Budget) -> Self {
-        Self { budget, deadline: budget.seconds, look: (0.0, 0), cost: None }
+        let cheaper = Cheaper::default();
+        Self { budget, deadline: budget.seconds, look: (0.0, 0), since: 0.0, cheaper, cost: None }
     }
 
     /// The budget.
@@ -109,12 +149,15 @@ impl Pacer {
         let left = (left - identity.min(0.2 * left)).max(0.0);
         self.deadline = used + if whole > 0.0 { left * mine / whole } else { left };
         self.look = (used, iteration);
+        self.since = 0.0;
+        self.cheaper = stages.first().map_or(Cheaper::default(), |share| share.cheaper);
     }
 
     /// Steps that the present stage shall have in all, after `iteration` of them; none keeps them as they are.
-    /// The stage is over when that is no more than `iteration`.
+    /// The stage is over when that is no more than `iteration`. `is_cheaper` says whether the step was one of those.
     #[must_use]
-    pub fn after_step(&mut self, iteration: u32, now: Seconds) -> Option<u32> {
+    pub fn after_step(&mut self, iteration: u32, is_cheaper: bool, now: Seconds) -> Option<u32> {
+        self.since += if is_cheaper { self.cheaper.cost } else { 1.0 };
         let used = self.budget.used(now);
         let left = self.deadline - used;
         let gap = LOOK_EVERY * self.budget.seconds;
@@ -123,16 +166,17 @@ impl Pacer {
         }
         let steps = iteration.saturating_sub(self.look.1);
         if steps > 0 && used - self.look.0 >= gap {
-            let cost = (used - self.look.0) / f64::from(steps);
+            let cost = (used - self.look.0) / self.since.max(1e-9);
             self.cost = Some(self.cost.map_or(cost, |old| old + NEWEST * (cost - old)));
-            self.look = (used, iteration);
+            (self.look, self.since) = ((used, iteration), 0.0);
         }
         if left <= 0.0 {
             return Some(iteration);
         }
-        let cost = self.cost.or_else(|| (steps > 0).then(|| (used - self.look.0) / f64::from(steps)))?;
+        let cost = self.cost.or_else(|| (steps > 0).then(|| (used - self.look.0) / self.since.max(1e-9)))?;
         // At least one more: the deadline itself ends the stage.
-        let more = (left / cost.max(1e-9)).ceil().clamp(1.0, f64::from(u32::MAX / 2));
+        let steps = self.cheaper.steps(f64::from(iteration), left / cost.max(1e-9));
+        let more = (steps - f64::from(iteration)).ceil().clamp(1.0, f64::from(u32::MAX / 2));
         Some(iteration.saturating_add(more as u32))
     }
 }
@@ -159,7 +203,7 @@ mod tests {
         let mut now = before;
         let at = |now: f64| Seconds { wall_s: 7.0 + now, cpu_s: 0.0 };
         let shares = [(Stage::Coarse, 0.02), (Stage::Fine, 0.78), (Stage::Instance, 0.2)]
-            .map(|(stage, weight)| StageShare { stage, weight });
+            .map(|(stage, weight)| StageShare { stage, weight, cheaper: Cheaper::default() });
         let mut done = Vec::new();
         for (k, share) in shares.iter().enumerate() {
             let start = now;
@@ -172,7 +216,7 @@ mod tests {
             while iteration < steps {
                 iteration += 1;
                 now += cost(share.stage, now / seconds);
-                if let Some(paced) = pacer.after_step(iteration, at(now)) {
+                if let Some(paced) = pacer.after_step(iteration, false, at(now)) {
                     steps = paced;
                 }
             }
@@ -209,6 +253,38 @@ mod tests {
                     assert!(steps > 0 && range.contains(&share), "{name}, {seconds} s, {stage}: {share}");
                 }
             }
+        }
+    }
+
+    #[test]
+    fn first_steps_that_cost_less_are_as_many_as_their_share_says() {
+        let budget =
+            Budget { seconds: 100.0, clock: BudgetClock::Wall, threads: 1, start: Seconds::default() };
+        for (share, cost) in [(0.0, 0.4), (0.4, 0.4), (0.7, 0.1), (1.0, 0.3)] {
+            let cheaper = Cheaper { share, cost };
+            let mut pacer = Pacer::new(budget);
+            let stage = StageShare { stage: Stage::Fine, weight: 1.0, cheaper };
+            let mut now = Seconds::default();
+            pacer.enter(&[stage], 0, OtherWork::default(), now);
+            let (mut iteration, mut steps, mut cheap, mut least) = (0, 700, 0, u32::MAX);
+            while iteration < steps {
+                iteration += 1;
+                let is_cheaper = f64::from(iteration) <= share * f64::from(steps);
+                cheap += u32::from(is_cheaper);
+                now.wall_s += 0.1 * if is_cheaper { cost } else { 1.0 };
+                steps = pacer.after_step(iteration, is_cheaper, now).unwrap_or(steps);
+                if now.wall_s > 3.0 {
+                    least = least.min(steps);
+                }
+            }
+            let expected = 99.5 / (0.1 * cheaper.mean());
+            assert!((f64::from(steps) / expected - 1.0).abs() < 0.01, "{steps} of {expected}: {cheaper:?}");
+            assert!(
+                (f64::from(cheap) / f64::from(steps) - share).abs() < 0.02,
+                "{cheap} of {steps}: {cheaper:?}"
+            );
+            // Known from the start, not when steps become dear.
+            assert!(f64::from(least) > 0.97 * expected, "{least} of {expected}: {cheaper:?}");
         }
     }
 

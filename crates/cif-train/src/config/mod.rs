@@ -83,8 +83,12 @@ pub struct StagesConfig {
     pub fine: u32,
     /// True when the coarse steps count towards `fine`, default no (A1).
     pub fine_includes_coarse: bool,
-    /// Instance steps, default 1500; skipped without masks.
+    /// Instance steps, default 1000; skipped without masks.
     pub instance: u32,
+    /// Share of the fine steps, the first ones, that see images of half the width and height, [0, 1], default 0.4, 0 in
+    /// `paper`; where no masks guide what moves, coarse steps see them too. Images whose shorter side has less than 128
+    /// pixels stay whole.
+    pub half_size: f32,
     /// Views per step, 1 to 1024, default 1 (A27: all stages alike).
     pub batch: u32,
 }
@@ -244,7 +248,7 @@ pub struct DensifyConfig {
     pub gradient_threshold: f32,
     /// By `gradient`: largest scale, as a fraction of the extent, that is cloned rather than split, default 0.01.
     pub split_scale: f32,
-    /// No additions beyond this many Gaussians, default 12 000; those with the largest gradient or error go first. What
+    /// No additions beyond this many Gaussians, default 20 000; those with the largest gradient or error go first. What
     /// travelling objects start with comes on top, see `motion.gaussians`, until additions by `error` take it in.
     pub max_gaussians: u32,
     /// Steps between prunings, default 100; 0 never.
@@ -333,7 +337,7 @@ pub struct HeadConfig {
 pub struct ResampleConfig {
     /// First event, default 100.
     pub from: u32,
-    /// Last event, default 1250 (A7: none in the last sixth of the stage).
+    /// Last event, default 800 (A7: none at the end of the stage).
     pub until: u32,
     /// Steps between events, default 100.
     pub every: u32,

@@ -10,12 +10,13 @@ fn removed() -> [(&'static str, Value); 2] {
 }
 
 /// Settings that there were not, with the value that runs went by.
-fn added() -> [(&'static str, Value); 4] {
+fn added() -> [(&'static str, Value); 5] {
     [
         ("/resample/weakness", "occupancy".into()),
         ("/model/triangulate", false.into()),
         ("/identity/share_rounds", 0.into()),
         ("/densify/rule", "gradient".into()),
+        ("/stages/half_size", 0.into()),
     ]
 }
 
@@ -65,10 +66,11 @@ mod tests {
         assert_eq!(TrainConfig::recorded(json.clone()).unwrap(), config);
         json["resample"].as_object_mut().unwrap().remove("weakness");
         json["densify"].as_object_mut().unwrap().remove("rule");
+        json["stages"].as_object_mut().unwrap().remove("half_size");
         let former = TrainConfig::recorded(json.clone()).unwrap();
         assert_eq!(
-            (former.resample.weakness, former.densify.rule),
-            (Weakness::Occupancy, DensifyRule::Gradient)
+            (former.resample.weakness, former.densify.rule, former.stages.half_size),
+            (Weakness::Occupancy, DensifyRule::Gradient, 0.0)
         );
         json["stages"]["tile_share"] = 0.5.into();
         let error = TrainConfig::recorded(json).unwrap_err();

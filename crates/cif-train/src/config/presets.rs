@@ -44,7 +44,7 @@ fn draft() -> TrainConfig {
     config.model.max_initial_points = 5_000;
     config.model.sh_interval = 150;
     config.densify =
-        DensifyConfig { from: 150, until: 1_200, every: 75, max_gaussians: 6_000, ..config.densify };
+        DensifyConfig { from: 150, until: 1_200, every: 75, max_gaussians: 12_000, ..config.densify };
     config.resample = ResampleConfig { from: 50, until: 400, every: 50, ..config.resample };
     // They take as long as all steps together.
     config.motion.parts = false;
@@ -54,8 +54,14 @@ fn draft() -> TrainConfig {
 fn paper(layout: Layout) -> TrainConfig {
     let mut config = TrainConfig { preset: Preset::Paper, ..TrainConfig::default() };
     config.near = 0.2;
-    config.stages =
-        StagesConfig { coarse: 3_000, fine: 10_000, fine_includes_coarse: false, instance: 3_000, batch: 1 };
+    config.stages = StagesConfig {
+        coarse: 3_000,
+        fine: 10_000,
+        fine_includes_coarse: false,
+        instance: 3_000,
+        half_size: 0.0,
+        batch: 1,
+    };
     config.model = ModelConfig {
         max_initial_points: 40_000,
         spatial_resolution: [64; 3],
@@ -185,7 +191,14 @@ impl Default for TrainConfig {
 
 impl Default for StagesConfig {
     fn default() -> Self {
-        Self { coarse: 300, fine: 7_000, fine_includes_coarse: false, instance: 1_500, batch: 1 }
+        Self {
+            coarse: 300,
+            fine: 7_000,
+            fine_includes_coarse: false,
+            instance: 1_000,
+            half_size: 0.4,
+            batch: 1,
+        }
     }
 }
 
@@ -271,7 +284,7 @@ impl Default for DensifyConfig {
             every: 100,
             gradient_threshold: 2e-4,
             split_scale: 0.01,
-            max_gaussians: 12_000,
+            max_gaussians: 20_000,
             prune_every: 100,
             prune_min_n: 0,
             prune_opacity: 0.005,
@@ -317,7 +330,7 @@ impl Default for ResampleConfig {
     fn default() -> Self {
         Self {
             from: 100,
-            until: 1_250,
+            until: 800,
             every: 100,
             rate: 0.01,
             gamma_floor: 1e-3,

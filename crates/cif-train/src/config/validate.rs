@@ -53,6 +53,12 @@ impl TrainConfig {
             stages.batch,
             "expected 1 to 1024 views per step",
         )?;
+        within(
+            "stages.half_size",
+            stages.half_size,
+            0.0..=1.0,
+            "expected a share of the fine steps, 0 to 1",
+        )?;
         check(
             stages.fine > 0 || stages.coarse > 0,
             "stages.fine",

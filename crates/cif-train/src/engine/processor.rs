@@ -123,7 +123,7 @@ impl Processor {
         let with_instances = labels.is_some();
         let instances = plan.settings.instances.filter(|_| with_instances);
         let settings = RenderSettings { instances, ..plan.settings };
-        let pass = self.renderer.forward(&state.field, &frame.camera, time, &settings, labels);
+        let pass = self.renderer.forward(&state.field, &view.camera, time, &settings, labels);
         let mut since = Instant::now();
         let exposure = state.progress.exposures.as_ref().map(|all| all.at(&frame.camera_name, time));
         let recorded = exposure.map(|exposure| {

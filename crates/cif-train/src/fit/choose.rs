@@ -3,6 +3,7 @@
 use super::Calibration;
 use crate::budget::{COARSE, FITS, INSTANCE};
 use crate::config::TrainConfig;
+use crate::half_size;
 
 /// Mean Gaussians of the fine stage as a share of the most.
 const MEAN_GAUSSIANS: f64 = 0.8;
@@ -65,7 +66,12 @@ fn expected_s(config: &TrainConfig, calibration: &Calibration, work: Workload, r
     // Densification may start with more than it may add up to.
     let mean = (MEAN_GAUSSIANS * most).max(calibration.gaussians.min(most as usize) as f64);
     let few = calibration.step_s(calibration.gaussians.min(most as usize) as f64, reduction);
-    let fine = f64::from(config.fine_iterations()) * calibration.step_s(mean, reduction);
+    let [width, height] = calibration.image_size.map(|side| side / reduction);
+    let half_size =
+        if half_size::is_possible(width, height) { f64::from(config.stages.half_size) } else { 0.0 };
+    let fine = f64::from(config.fine_iterations())
+        * (half_size * calibration.step_s(mean, 2 * reduction)
+            + (1.0 - half_size) * calibration.step_s(mean, reduction));
     let coarse = f64::from(config.stages.coarse) * few * if work.is_dynamic { COARSE } else { 1.0 };
     let instance = f64::from(config.stages.instance) * INSTANCE * calibration.step_s(most, reduction);
     coarse + fine + if work.has_instances { instance } else { 0.0 }
@@ -203,7 +209,7 @@ mod tests {
             assert!((choice.expected_s / seconds - 1.0).abs() < 0.02, "{seconds}: {}", choice.expected_s);
             let now = (choice.config.stages.fine, choice.config.densify.max_gaussians);
             assert!(now.0 > last.0 && now.1 > last.1, "{seconds}: {now:?} after {last:?}");
-            assert!(now.0 < 7_000 && now.1 < 12_000);
+            assert!(now.0 < base.stages.fine && now.1 < base.densify.max_gaussians);
             assert!(choice.config.densify.until < choice.config.stages.fine);
             assert!(choice.config.resample.until < choice.config.stages.instance);
             assert!(choice.changes.iter().any(|change| change.setting == "steps with motion"));
@@ -228,10 +234,10 @@ mod tests {
     fn more_time_than_needed_gives_more_than_the_base_up_to_a_limit() {
         let base = TrainConfig::default();
         let choice = choose(&base, &MEASURED, WORK, 1e6);
-        assert_eq!(choice.config.stages.fine, 28_000);
-        assert_eq!(choice.config.densify.max_gaussians, 24_000);
+        assert_eq!(choice.config.stages.fine, 4 * base.stages.fine);
+        assert_eq!(choice.config.densify.max_gaussians, 2 * base.densify.max_gaussians);
         assert!(choice.expected_s < 1e5);
         let kept = choose(&base, &MEASURED, Workload { may_change_gaussians: false, ..WORK }, 60.0);
-        assert_eq!(kept.config.densify.max_gaussians, 12_000);
+        assert_eq!(kept.config.densify.max_gaussians, base.densify.max_gaussians);
     }
 }

@@ -31,15 +31,18 @@ impl Trainer {
             Stage::Instance => INSTANCE,
             _ => 1.0,
         };
-        let step_s = 1.0 / (rate * cost(stage)).max(1e-9);
-        let steps = |of: Stage| {
-            let done = if of == stage { self.state.progress.iteration } else { 0 };
-            f64::from(self.stages.iterations(&self.state.config, of).saturating_sub(done)) * cost(of)
+        let all = |of: Stage| self.stages.iterations(&self.state.config, of);
+        let done = |of: Stage| if of == stage { self.state.progress.iteration } else { 0 };
+        let steps = |of: Stage, from: u32, to: u32| {
+            let cheaper = self.cheaper(of);
+            (cheaper.cost_up_to(to, all(of)) - cheaper.cost_up_to(from, all(of))) * cost(of)
         };
+        let (last, left) = (done(stage).max(1), |of: Stage| steps(of, done(of), all(of).max(done(of))));
+        let step_s = 1.0 / (rate * steps(stage, last - 1, last)).max(1e-9);
         let stages = [Stage::Coarse, Stage::Fine, Stage::Instance].into_iter().filter(|of| *of >= stage);
         let identity = IDENTITY_STEPS_PER_FRAME * self.frames_of_identities(stage) as f64;
         let fits_s = if stage == Stage::Coarse { self.fits_s() } else { 0.0 };
-        (stages.map(steps).sum::<f64>() + identity) * step_s + fits_s
+        (stages.map(left).sum::<f64>() + identity) * step_s + fits_s
     }
 
     /// Estimated seconds of the fits to come, by those of objects that were tried before; 0 where none was.

@@ -26,7 +26,7 @@ impl Trainer {
     /// A run inside `stage`, for measuring its steps; the optimiser starts there. Without `scene` it begins
     /// with the points of the capture: its fine stage with a fresh deformation, its instance stage after
     /// `warm_up` fine steps and an estimation of identities. A scene keeps what it has and `stage` uses, and
-    /// gets what is missing.
+    /// gets what is missing. All steps see whole images.
     ///
     /// # Errors
     /// As [`Trainer::new`]; when the scene has other instances than the capture; when the instance stage is
@@ -36,13 +36,15 @@ impl Trainer {
     /// When `stage` is none that has steps.
     pub fn for_measuring(
         mut dataset: Dataset,
-        config: TrainConfig,
+        mut config: TrainConfig,
         scene: Option<Field>,
         stage: Stage,
         warm_up: u32,
     ) -> Result<Self, TrainError> {
         assert!(stage.has_steps(), "the {stage} stage has no steps");
         config.validate()?;
+        // Steps like those at the end of their stage.
+        config.stages.half_size = 0.0;
         let measured_frames = MeasuredFrames::withhold(&mut dataset, &config);
         let is_trained = scene.is_some();
         let mut field = match scene {

@@ -45,6 +45,8 @@ mod guidance;
 #[cfg(test)]
 mod guidance_tests;
 #[cfg(test)]
+mod half_size_tests;
+#[cfg(test)]
 mod head_tests;
 mod heads;
 mod identity;

@@ -7,13 +7,16 @@
 use serde_json::{Value, json};
 
 use super::Trainer;
-use crate::budget::{Budget, FITS, OtherWork, Pacer, REHEARSAL, TRIALS, weights};
+use crate::budget::{Budget, Cheaper, FITS, OtherWork, Pacer, REHEARSAL, TRIALS, weights};
 use crate::curve::{CurvePoint, Targets};
 use crate::error::TrainError;
+use crate::half_size;
 use crate::phase::Phase;
 use crate::phases::Deadline;
 use crate::progress::Goals;
+use crate::schedule::Due;
 use crate::stage::Stage;
+use crate::state::State;
 
 /// Points of a stage before its trend is believed.
 const POINTS_OF_TREND: usize = 6;
@@ -86,15 +89,15 @@ impl Trainer {
 
     /// Gives a stage that begins, or goes on, its deadline.
     pub(super) fn pace_stage(&mut self, stage: Stage) {
-        let steps: Vec<(Stage, u32)> = [Stage::Coarse, Stage::Fine, Stage::Instance]
+        let steps: Vec<(Stage, u32, Cheaper)> = [Stage::Coarse, Stage::Fine, Stage::Instance]
             .into_iter()
             .filter(|other| *other >= stage)
             .map(|other| (other, self.stages.iterations(&self.state.config, other)))
             .map(|(other, steps)| {
                 let done = if other == stage { self.state.progress.iteration } else { 0 };
-                (other, steps.saturating_sub(done))
+                (other, steps.saturating_sub(done), self.cheaper(other))
             })
-            .filter(|(other, steps)| *steps > 0 || *other == stage)
+            .filter(|(other, steps, _)| *steps > 0 || *other == stage)
             .collect();
         let other = OtherWork {
             identity_frames: self.frames_of_identities(stage),
@@ -103,6 +106,17 @@ impl Trainer {
         let (iteration, now) = (self.state.progress.iteration, self.state.phases.now());
         let Some(pacing) = &mut self.pacing else { return };
         pacing.pacer.enter(&weights(&steps), iteration, other, now);
+    }
+
+    /// First steps of a stage that cost less than the others, as they see smaller images.
+    pub(super) fn cheaper(&self, stage: Stage) -> Cheaper {
+        let State { dataset, frames, config, .. } = &self.state;
+        let camera = &dataset.frames[frames.index(0)].camera;
+        let share = match stage {
+            Stage::Fine if half_size::is_possible(camera.width, camera.height) => config.stages.half_size,
+            _ => 0.0,
+        };
+        Cheaper { share: f64::from(share), cost: half_size::COST }
     }
 
     /// Frames that identity estimation passes over behind a stage.
@@ -133,9 +147,10 @@ impl Trainer {
 
     /// Stretches or ends the stage as the budget says.
     pub(super) fn follow_budget(&mut self, stage: Stage) {
-        let now = self.state.phases.now();
+        let (iteration, now) = (self.state.progress.iteration, self.state.phases.now());
+        let is_cheaper = self.done().has(Due::HalveImages);
         let Some(pacing) = &mut self.pacing else { return };
-        let Some(steps) = pacing.pacer.after_step(self.state.progress.iteration, now) else { return };
+        let Some(steps) = pacing.pacer.after_step(iteration, is_cheaper, now) else { return };
         let shares = pacing.shares;
         self.set_steps(stage, steps);
         let scaled = |share: f64, steps: u32| (share * f64::from(steps)).round() as u32;

@@ -16,6 +16,7 @@ use crate::effects::is_judged;
 use crate::error::TrainError;
 use crate::exposure::RATES;
 use crate::frames::MOST_AHEAD;
+use crate::half_size;
 use crate::heads::{CameraBlending, Phase, Target, ValueHead};
 use crate::metrics::image::{ssim, unit_color};
 use crate::optimiser::StepRates;
@@ -64,16 +65,22 @@ impl Trainer {
     pub(super) fn plan_step(&mut self, stage: Stage, iteration: u32) -> Result<StepPlan, TrainError> {
         let batch = self.state.config.stages.batch;
         let at = self.moment(stage, iteration, self.state.progress.total_steps + 1);
-        let [holds_out, renormalises] = [Due::HoldOut, Due::Renormalise].map(|due| at.has(due));
+        let [halves, holds_out, renormalises] =
+            [Due::HalveImages, Due::HoldOut, Due::Renormalise].map(|due| at.has(due));
         let holds_out = holds_out || self.effects.iter().any(|effect| effect.holds_out(&at));
         let counts_statistics = at.is_of_colors() && self.density.counts_statistics(&at);
         let mut views = Vec::with_capacity(batch as usize);
         for k in 0..batch {
             let view = self.view_at(stage, u64::from(iteration - 1) * u64::from(batch) + u64::from(k));
-            let frame = self.state.frames.get(&self.state.dataset, view)?;
+            let mut frame = self.state.frames.get(&self.state.dataset, view)?;
             let index = self.state.frames.index(view);
             let leaves_judged = holds_out && is_judged(&self.state.frames, index);
-            views.push(StepView { index, frame, leaves_judged });
+            let mut camera = self.state.dataset.frames[index].camera;
+            // Pixels that are left out are single ones.
+            if halves && !leaves_judged && half_size::is_possible(camera.width, camera.height) {
+                (frame, camera) = (Arc::new(half_size::of_frame(&frame)), half_size::of_camera(&camera));
+            }
+            views.push(StepView { index, frame, camera, leaves_judged });
         }
         self.expect_views(stage, u64::from(iteration) * u64::from(batch));
         let in_instance_stage = stage == Stage::Instance;

@@ -11,9 +11,9 @@ use cif_geometry::{LensDistortion, PinholeCamera, RigidTransform};
 use cif_train::{Clock, Control, Outcome, Seconds, TrainConfig, TrainEvent, Trainer};
 use glam::{DMat3, DVec2, DVec3};
 
-/// Size of the images.
+/// Size of the images where the scene has them no larger.
 pub(crate) const WIDTH: u32 = 48;
-/// Size of the images.
+/// Size of the images where the scene has them no larger.
 pub(crate) const HEIGHT: u32 = 36;
 
 /// Parameters of the synthetic capture.
@@ -40,6 +40,8 @@ pub(crate) struct Scene {
     pub(crate) shiny: bool,
     /// The third ball stays where it is first.
     pub(crate) frozen: bool,
+    /// Images are so many times as wide and high.
+    pub(crate) larger: u32,
 }
 
 impl Default for Scene {
@@ -55,6 +57,7 @@ impl Default for Scene {
             disagree: false,
             shiny: false,
             frozen: false,
+            larger: 1,
         }
     }
 }
@@ -117,11 +120,11 @@ fn write_frame(
     mask: Option<&Path>,
 ) {
     let empty = if scene.disagree { 0 } else { 255 };
-    let mut rgb = image::RgbImage::from_pixel(WIDTH, HEIGHT, image::Rgb([empty; 3]));
-    let mut ids = image::GrayImage::new(WIDTH, HEIGHT);
+    let mut rgb = image::RgbImage::from_pixel(camera.width, camera.height, image::Rgb([empty; 3]));
+    let mut ids = image::GrayImage::new(camera.width, camera.height);
     let world_from_camera = camera.camera_from_world.inverse();
-    for y in 0..HEIGHT {
-        for x in 0..WIDTH {
+    for y in 0..camera.height {
+        for x in 0..camera.width {
             let pixel = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
             let ray = ((pixel - camera.principal_px) / camera.focal_px).extend(1.0);
             let direction = (world_from_camera.rotation * ray).normalize();
@@ -174,7 +177,8 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
             // The last view is held out, between the others.
             let held_out = view == scene.views;
             let turn = if held_out { 0.5 } else { view as f64 };
-            let camera = camera((turn / scene.views as f64 - 0.4) * 2.4);
+            let camera = camera((turn / scene.views as f64 - 0.4) * 2.4)
+                .resized(WIDTH * scene.larger, HEIGHT * scene.larger);
             let name = format!("{view}_{time_index}");
             let image = folder.join(format!("{name}.png"));
             let mask = scene.masks.then(|| folder.join(format!("{name}_mask.png")));
@@ -186,7 +190,7 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
             };
             write_frame(&camera, scene, (*time, gain), &image, mask.as_deref());
             if let Some(mask) = mask.as_ref().filter(|_| scene.empty_masks) {
-                image::GrayImage::new(WIDTH, HEIGHT).save(mask).unwrap();
+                image::GrayImage::new(camera.width, camera.height).save(mask).unwrap();
             }
             frames.push(Frame {
                 name,

@@ -34,7 +34,7 @@ impl GpuEngine {
             present.dedup();
             present.retain(|label| *label != UNLABELLED);
             let fresh;
-            let target = match targets.get(&state.frames.index(view)) {
+            let target = match targets.get(&(state.frames.index(view), data.image.width)) {
                 Some(target) => target,
                 None => {
                     fresh = GpuTarget::new(gpu, &data.image, Some(labels))?;

@@ -76,8 +76,8 @@ pub(crate) struct GpuEngine {
     rearranger: GpuRearranger,
     /// Where the rows of a set that is changing come from.
     origins: Option<Vec<u32>>,
-    /// Training frames on the device, by index in the capture, and their bytes.
-    targets: BTreeMap<usize, GpuTarget>,
+    /// Training images on the device, by index in the capture and width, and their bytes.
+    targets: BTreeMap<(usize, u32), GpuTarget>,
     target_bytes: u64,
     /// `None` until the first step.
     resident: Option<Resident>,

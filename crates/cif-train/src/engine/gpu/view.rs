@@ -62,7 +62,7 @@ impl GpuEngine {
             ..
         } = self;
         let fresh;
-        let target = match targets.get(&view.index) {
+        let target = match targets.get(&key(view)) {
             Some(target) => target,
             None => {
                 fresh = GpuTarget::new(gpu, &view.frame.image, view.frame.labels.as_ref())?;
@@ -81,7 +81,7 @@ impl GpuEngine {
             labelled_pixels: view.frame.labelled,
             weight: (plan.label_share(view) * f64::from(state.config.loss.lambda_instance)) as f32,
         });
-        let input = ViewInput { camera: &frame.camera, settings: &settings, labels };
+        let input = ViewInput { camera: &view.camera, settings: &settings, labels };
 
         let mut commands = Commands::new(gpu, timestamps.as_mut());
         if let Some(identities) = resident.identities.as_ref().filter(|_| first && with_instances) {
@@ -259,13 +259,18 @@ impl GpuEngine {
 impl GpuEngine {
     /// Keeps a frame on the device, while `budget` bytes hold them.
     pub(super) fn keep_target(&mut self, view: &StepView, budget: u64) -> Result<(), GpuError> {
-        if !self.targets.contains_key(&view.index) && self.target_bytes < budget {
+        if !self.targets.contains_key(&key(view)) && self.target_bytes < budget {
             let target = GpuTarget::new(&self.gpu, &view.frame.image, view.frame.labels.as_ref())?;
             self.target_bytes += target.bytes();
-            self.targets.insert(view.index, target);
+            self.targets.insert(key(view), target);
         }
         Ok(())
     }
+}
+
+/// Names the image of a view: the index of its frame, and the width.
+fn key(view: &StepView) -> (usize, u32) {
+    (view.index, view.frame.image.width)
 }
 
 /// Adds the times of a submission to the parts of a step.
