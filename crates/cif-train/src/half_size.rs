@@ -4,24 +4,7 @@
 use cif_geometry::{PinholeCamera, PixelGrid};
 use cif_render::UNLABELLED;
 
-use crate::config::TrainConfig;
 use crate::frames::TrainFrame;
-
-/// Pixels that the shorter side of an image has at least afterwards.
-const SMALLEST: u32 = 64;
-
-/// Cost of a step relative to that of one on whole images.
-pub(crate) const COST: f64 = 0.45;
-
-/// True where images of a size may be halved.
-pub(crate) fn is_possible(width: u32, height: u32) -> bool {
-    width.min(height) / 2 >= SMALLEST
-}
-
-/// The last step of a fine stage of so many that sees halved images; 0: none does.
-pub(crate) fn last_step(config: &TrainConfig, steps: u32) -> u32 {
-    (f64::from(config.stages.half_size) * f64::from(steps)) as u32
-}
 
 /// A frame whose pixels are the mean colours of four, with the label of the last of these; an odd row or column at the
 /// end is left out.
@@ -98,10 +81,5 @@ mod tests {
         let place = DVec3::new(0.3, -0.2, 1.7);
         let [of_whole, of_half] = [&camera, &small].map(|camera| camera.project(place).unwrap().0);
         assert!((of_whole / 2.0 - of_half).length() < 1e-12, "{of_whole} {of_half}");
-    }
-
-    #[test]
-    fn small_images_stay_whole() {
-        assert!(is_possible(128, 400) && !is_possible(127, 400) && !is_possible(400, 96));
     }
 }

@@ -3,7 +3,7 @@
 use super::Calibration;
 use crate::budget::{COARSE, FITS, INSTANCE};
 use crate::config::TrainConfig;
-use crate::half_size;
+use crate::schedule::may_halve;
 
 /// Mean Gaussians of the fine stage as a share of the most.
 const MEAN_GAUSSIANS: f64 = 0.8;
@@ -67,8 +67,7 @@ fn expected_s(config: &TrainConfig, calibration: &Calibration, work: Workload, r
     let mean = (MEAN_GAUSSIANS * most).max(calibration.gaussians.min(most as usize) as f64);
     let few = calibration.step_s(calibration.gaussians.min(most as usize) as f64, reduction);
     let [width, height] = calibration.image_size.map(|side| side / reduction);
-    let half_size =
-        if half_size::is_possible(width, height) { f64::from(config.stages.half_size) } else { 0.0 };
+    let half_size = if may_halve(width, height) { f64::from(config.stages.half_size) } else { 0.0 };
     let fine = f64::from(config.fine_iterations())
         * (half_size * calibration.step_s(mean, 2 * reduction)
             + (1.0 - half_size) * calibration.step_s(mean, reduction));

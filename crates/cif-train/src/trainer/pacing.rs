@@ -10,11 +10,10 @@ use super::Trainer;
 use crate::budget::{Budget, Cheaper, FITS, OtherWork, Pacer, REHEARSAL, TRIALS, weights};
 use crate::curve::{CurvePoint, Targets};
 use crate::error::TrainError;
-use crate::half_size;
 use crate::phase::Phase;
 use crate::phases::Deadline;
 use crate::progress::Goals;
-use crate::schedule::Due;
+use crate::schedule::{Due, HALF_SIZE, may_halve};
 use crate::stage::Stage;
 use crate::state::State;
 
@@ -113,10 +112,10 @@ impl Trainer {
         let State { dataset, frames, config, .. } = &self.state;
         let camera = &dataset.frames[frames.index(0)].camera;
         let share = match stage {
-            Stage::Fine if half_size::is_possible(camera.width, camera.height) => config.stages.half_size,
+            Stage::Fine if may_halve(camera.width, camera.height) => config.stages.half_size,
             _ => 0.0,
         };
-        Cheaper { share: f64::from(share), cost: half_size::COST }
+        Cheaper { share: f64::from(share), cost: HALF_SIZE }
     }
 
     /// Frames that identity estimation passes over behind a stage.

@@ -21,7 +21,7 @@ use crate::heads::{CameraBlending, Phase, Target, ValueHead};
 use crate::metrics::image::{ssim, unit_color};
 use crate::optimiser::StepRates;
 use crate::random::{Purpose, stream};
-use crate::schedule::{Due, log_linear, schedule_steps};
+use crate::schedule::{Due, log_linear, may_halve, schedule_steps};
 use crate::stage::Stage;
 use crate::state::State;
 use crate::step::{HeadTarget, StepPlan, StepView};
@@ -77,7 +77,7 @@ impl Trainer {
             let leaves_judged = holds_out && is_judged(&self.state.frames, index);
             let mut camera = self.state.dataset.frames[index].camera;
             // Pixels that are left out are single ones.
-            if halves && !leaves_judged && half_size::is_possible(camera.width, camera.height) {
+            if halves && !leaves_judged && may_halve(camera.width, camera.height) {
                 (frame, camera) = (Arc::new(half_size::of_frame(&frame)), half_size::of_camera(&camera));
             }
             views.push(StepView { index, frame, camera, leaves_judged });
