@@ -33,6 +33,12 @@ impl Cheaper {
         f64::from(done) - cheaper * (1.0 - self.cost)
     }
 
+    /// Cost of a step, from 1, of so many.
+    #[must_use]
+    pub fn cost_of(&self, step: u32, steps: u32) -> f64 {
+        self.cost_up_to(step, steps) - self.cost_up_to(step.saturating_sub(1), steps)
+    }
+
     /// Steps of the stage where, after the first `done`, there is time for `more` that cost 1.
     fn steps(&self, done: f64, more: f64) -> f64 {
         let steps = (more + done * self.cost) / self.mean();
@@ -102,8 +108,8 @@ pub struct Pacer {
     budget: Budget,
     /// Time by which the present stage has to end, seconds of the budget.
     deadline: f64,
-    /// Last look: time and step of the stage.
-    look: (f64, u32),
+    /// Time of the last look.
+    look: f64,
     /// Cost of the steps since then, relative to the last ones of the stage.
     since: f64,
     /// First steps of the present stage that cost less.
@@ -117,7 +123,7 @@ impl Pacer {
     #[must_use]
     pub fn new(budget: Budget) -> Self {
         let cheaper = Cheaper::default();
-        Self { budget, deadline: budget.seconds, look: (0.0, 0), since: 0.0, cheaper, cost: None }
+        Self { budget, deadline: budget.seconds, look: 0.0, since: 0.0, cheaper, cost: None }
     }
 
     /// The budget.
@@ -137,8 +143,8 @@ impl Pacer {
         (self.end() - self.budget.used(now)).max(0.0)
     }
 
-    /// Begins the first of `stages`, which are all that are left and have steps, after `iteration` of its steps.
-    pub fn enter(&mut self, stages: &[StageShare], iteration: u32, other: OtherWork, now: Seconds) {
+    /// Begins the first of `stages`, which are all that are left and have steps, or goes on with it.
+    pub fn enter(&mut self, stages: &[StageShare], other: OtherWork, now: Seconds) {
         let used = self.budget.used(now);
         let whole: f64 = stages.iter().map(|share| share.weight).sum();
         let mine = stages.first().map_or(0.0, |share| share.weight);
@@ -148,32 +154,30 @@ impl Pacer {
             self.cost.map_or(0.0, |cost| cost * IDENTITY_STEPS_PER_FRAME) * other.identity_frames as f64;
         let left = (left - identity.min(0.2 * left)).max(0.0);
         self.deadline = used + if whole > 0.0 { left * mine / whole } else { left };
-        self.look = (used, iteration);
-        self.since = 0.0;
+        (self.look, self.since) = (used, 0.0);
         self.cheaper = stages.first().map_or(Cheaper::default(), |share| share.cheaper);
     }
 
-    /// Steps that the present stage shall have in all, after `iteration` of them; none keeps them as they are.
-    /// The stage is over when that is no more than `iteration`. `is_cheaper` says whether the step was one of those.
+    /// Steps that the present stage shall have in all, after `iteration` of the `steps` planned so far; none keeps these.
+    /// The stage is over when that is no more than `iteration`.
     #[must_use]
-    pub fn after_step(&mut self, iteration: u32, is_cheaper: bool, now: Seconds) -> Option<u32> {
-        self.since += if is_cheaper { self.cheaper.cost } else { 1.0 };
+    pub fn after_step(&mut self, iteration: u32, steps: u32, now: Seconds) -> Option<u32> {
+        self.since += self.cheaper.cost_of(iteration, steps);
         let used = self.budget.used(now);
         let left = self.deadline - used;
         let gap = LOOK_EVERY * self.budget.seconds;
-        if left > 2.0 * gap && used - self.look.0 < gap {
+        if left > 2.0 * gap && used - self.look < gap {
             return None;
         }
-        let steps = iteration.saturating_sub(self.look.1);
-        if steps > 0 && used - self.look.0 >= gap {
-            let cost = (used - self.look.0) / self.since.max(1e-9);
-            self.cost = Some(self.cost.map_or(cost, |old| old + NEWEST * (cost - old)));
-            (self.look, self.since) = ((used, iteration), 0.0);
+        let newest = (used - self.look) / self.since.max(1e-9);
+        if used - self.look >= gap {
+            self.cost = Some(self.cost.map_or(newest, |old| old + NEWEST * (newest - old)));
+            (self.look, self.since) = (used, 0.0);
         }
         if left <= 0.0 {
             return Some(iteration);
         }
-        let cost = self.cost.or_else(|| (steps > 0).then(|| (used - self.look.0) / self.since.max(1e-9)))?;
+        let cost = self.cost.unwrap_or(newest);
         // At least one more: the deadline itself ends the stage.
         let steps = self.cheaper.steps(f64::from(iteration), left / cost.max(1e-9));
         let more = (steps - f64::from(iteration)).ceil().clamp(1.0, f64::from(u32::MAX / 2));
@@ -211,12 +215,12 @@ mod tests {
                 now += identity;
             }
             let identity_frames = if share.stage == Stage::Instance { 0 } else { 100 };
-            pacer.enter(&shares[k..], 0, OtherWork { identity_frames, has_fits: false }, at(now));
+            pacer.enter(&shares[k..], OtherWork { identity_frames, has_fits: false }, at(now));
             let (mut iteration, mut steps) = (0, 1_000);
             while iteration < steps {
                 iteration += 1;
                 now += cost(share.stage, now / seconds);
-                if let Some(paced) = pacer.after_step(iteration, false, at(now)) {
+                if let Some(paced) = pacer.after_step(iteration, steps, at(now)) {
                     steps = paced;
                 }
             }
@@ -265,14 +269,14 @@ mod tests {
             let mut pacer = Pacer::new(budget);
             let stage = StageShare { stage: Stage::Fine, weight: 1.0, cheaper };
             let mut now = Seconds::default();
-            pacer.enter(&[stage], 0, OtherWork::default(), now);
+            pacer.enter(&[stage], OtherWork::default(), now);
             let (mut iteration, mut steps, mut cheap, mut least) = (0, 700, 0, u32::MAX);
             while iteration < steps {
                 iteration += 1;
                 let is_cheaper = f64::from(iteration) <= share * f64::from(steps);
                 cheap += u32::from(is_cheaper);
                 now.wall_s += 0.1 * if is_cheaper { cost } else { 1.0 };
-                steps = pacer.after_step(iteration, is_cheaper, now).unwrap_or(steps);
+                steps = pacer.after_step(iteration, steps, now).unwrap_or(steps);
                 if now.wall_s > 3.0 {
                     least = least.min(steps);
                 }

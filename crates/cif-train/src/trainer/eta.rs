@@ -33,12 +33,12 @@ impl Trainer {
         };
         let all = |of: Stage| self.stages.iterations(&self.state.config, of);
         let done = |of: Stage| if of == stage { self.state.progress.iteration } else { 0 };
-        let steps = |of: Stage, from: u32, to: u32| {
-            let cheaper = self.cheaper(of);
-            (cheaper.cost_up_to(to, all(of)) - cheaper.cost_up_to(from, all(of))) * cost(of)
+        let last = self.cheaper(stage).cost_of(done(stage).max(1), all(stage)) * cost(stage);
+        let step_s = 1.0 / (rate * last).max(1e-9);
+        let left = |of: Stage| {
+            let (cheaper, steps) = (self.cheaper(of), all(of).max(done(of)));
+            (cheaper.cost_up_to(steps, all(of)) - cheaper.cost_up_to(done(of), all(of))) * cost(of)
         };
-        let (last, left) = (done(stage).max(1), |of: Stage| steps(of, done(of), all(of).max(done(of))));
-        let step_s = 1.0 / (rate * steps(stage, last - 1, last)).max(1e-9);
         let stages = [Stage::Coarse, Stage::Fine, Stage::Instance].into_iter().filter(|of| *of >= stage);
         let identity = IDENTITY_STEPS_PER_FRAME * self.frames_of_identities(stage) as f64;
         let fits_s = if stage == Stage::Coarse { self.fits_s() } else { 0.0 };

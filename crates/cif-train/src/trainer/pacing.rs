@@ -13,7 +13,7 @@ use crate::error::TrainError;
 use crate::phase::Phase;
 use crate::phases::Deadline;
 use crate::progress::Goals;
-use crate::schedule::{Due, HALF_SIZE, may_halve};
+use crate::schedule::{HALF_SIZE, may_halve};
 use crate::stage::Stage;
 use crate::state::State;
 
@@ -102,9 +102,9 @@ impl Trainer {
             identity_frames: self.frames_of_identities(stage),
             has_fits: stage == Stage::Coarse && self.objects_to_fit() > 0,
         };
-        let (iteration, now) = (self.state.progress.iteration, self.state.phases.now());
+        let now = self.state.phases.now();
         let Some(pacing) = &mut self.pacing else { return };
-        pacing.pacer.enter(&weights(&steps), iteration, other, now);
+        pacing.pacer.enter(&weights(&steps), other, now);
     }
 
     /// First steps of a stage that cost less than the others, as they see smaller images.
@@ -147,9 +147,9 @@ impl Trainer {
     /// Stretches or ends the stage as the budget says.
     pub(super) fn follow_budget(&mut self, stage: Stage) {
         let (iteration, now) = (self.state.progress.iteration, self.state.phases.now());
-        let is_cheaper = self.done().has(Due::HalveImages);
+        let planned = self.stages.iterations(&self.state.config, stage);
         let Some(pacing) = &mut self.pacing else { return };
-        let Some(steps) = pacing.pacer.after_step(iteration, is_cheaper, now) else { return };
+        let Some(steps) = pacing.pacer.after_step(iteration, planned, now) else { return };
         let shares = pacing.shares;
         self.set_steps(stage, steps);
         let scaled = |share: f64, steps: u32| (share * f64::from(steps)).round() as u32;
