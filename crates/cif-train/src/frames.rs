@@ -131,6 +131,23 @@ impl FrameStore {
         Ok(store)
     }
 
+    /// Frames of a capture, by their indices, of which none is kept.
+    pub(crate) fn decoded_ahead(dataset: &Dataset, indices: Vec<usize>, background: [f32; 3]) -> Self {
+        let decoding = Decoding {
+            label_of_id: vec![UNLABELLED; usize::from(u16::MAX) + 1],
+            background,
+            maps: BTreeMap::new(),
+            switched: BTreeMap::new(),
+            moves_edges: false,
+        };
+        Self {
+            frames: indices.into_iter().map(|index| (index, None)).collect(),
+            decoding: Arc::new(decoding),
+            ahead: Some(Ahead::of(dataset)),
+            masks: Mutex::default(),
+        }
+    }
+
     /// Begins to decode training frames that are needed soon, in the order given, on other threads. Frames that are in
     /// memory, or begun already, are passed over; those begun before that are not among them are given up.
     pub(crate) fn expect(&self, coming: impl IntoIterator<Item = usize>) {

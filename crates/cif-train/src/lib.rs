@@ -91,6 +91,7 @@ pub mod tracks;
 pub mod trainer;
 #[cfg(feature = "wgpu")]
 pub mod wgpu;
+mod working_size;
 
 pub use clock::{Clock, Seconds, SystemClock};
 pub use config::{Ablation, HeadName, ObjectMotion, Preset, TrainConfig};

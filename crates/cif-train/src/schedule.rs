@@ -34,16 +34,12 @@ pub fn schedule_steps(config: &TrainConfig) -> u32 {
     }
 }
 
-/// Cost of a step on images of half the width and height, relative to one on whole images: 0.37 to 0.75 on four captures
-/// of 256 x 192 to 800 x 600, least where most stands still and images are large.
-pub(crate) const HALF_SIZE: f64 = 0.6;
-
-/// Pixels that the shorter side of a halved image has at least.
-const SMALLEST_HALF: u32 = 64;
+/// Pixels that the shorter side of a reduced image has at least.
+pub(crate) const SMALLEST_SIDE: u32 = 64;
 
 /// True where steps may see images of such a size at half of it.
 pub(crate) fn may_halve(width: u32, height: u32) -> bool {
-    width.min(height) / 2 >= SMALLEST_HALF
+    width.min(height) / 2 >= SMALLEST_SIDE
 }
 
 /// Properties of the capture that decide which stages a run has.
@@ -124,6 +120,8 @@ impl Stages {
 pub enum Due {
     /// The step sees images of half the width and height.
     HalveImages,
+    /// The step sees whole images of a run that works on reduced ones.
+    WholeImages,
     /// Before the step: the present degree of spherical harmonics is tried, as the next one is due.
     TryHarmonics,
     /// Before the step: degrees of spherical harmonics that do not help are taken back, for good.
@@ -165,8 +163,9 @@ struct Row {
 }
 
 /// What falls on which step. Source: methods reference 1.5 and 6 (changes of the set), 11 (effects).
-const TABLE: [Row; 17] = [
+const TABLE: [Row; 18] = [
     Row { due: Due::HalveImages, falls: |at| at.sees_half_size() },
+    Row { due: Due::WholeImages, falls: |at| at.sees_whole_size() },
     Row {
         due: Due::TryHarmonics,
         falls: |at| at.judges_harmonics() && at.every(at.config.model.sh_interval),
@@ -263,6 +262,13 @@ impl Moment<'_> {
         (f64::from(self.config.stages.half_size) * f64::from(self.last_of_fine())) as u32
     }
 
+    /// True of the last fine steps of a run that works on reduced images.
+    fn sees_whole_size(&self) -> bool {
+        let (stages, last) = (&self.config.stages, self.last_of_fine());
+        let whole = (f64::from(stages.whole_size) * f64::from(last)) as u32;
+        stages.reduction > 1 && self.stage == Stage::Fine && self.iteration > last - whole.min(last)
+    }
+
     fn every(&self, steps: u32) -> bool {
         falls_on(self.iteration, steps)
     }
@@ -302,7 +308,7 @@ impl Moment<'_> {
     fn sees_half_size(&self) -> bool {
         match self.stage {
             Stage::Coarse => self.config.stages.half_size > 0.0 && !self.facts.stages.are_guided(self.config),
-            Stage::Fine => self.iteration <= self.last_of_half_size(),
+            Stage::Fine => self.iteration <= self.last_of_half_size() && !self.sees_whole_size(),
             _ => false,
         }
     }

@@ -22,10 +22,14 @@ use crate::phases::Phases;
 use crate::poses::PoseMoments;
 use crate::progress::Progress;
 use crate::times::StepTimes;
+use crate::working_size::Whole;
 
 /// Capture, settings, and what steps change.
 pub(crate) struct State {
+    /// The capture, with its images at the size that is worked on.
     pub dataset: Dataset,
+    /// The capture as it is, where that is another size.
+    pub whole: Option<Whole>,
     pub config: TrainConfig,
     /// Gaussians nearer to the camera than this are not drawn.
     pub near: f32,
@@ -71,6 +75,11 @@ pub(crate) struct Kept {
 }
 
 impl State {
+    /// The capture as it is, whatever the size of images that is worked on.
+    pub(crate) fn capture(&self) -> &Dataset {
+        self.whole.as_ref().map_or(&self.dataset, |whole| &whole.capture)
+    }
+
     /// Settings of the instance pass, or of the weights of a head that blends values of its own by those; `None` where it
     /// blends them like colour.
     pub(crate) fn instance_settings(&self) -> Option<InstanceSettings> {

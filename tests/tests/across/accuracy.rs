@@ -197,7 +197,8 @@ fn the_configuration_of_the_paper_is_a_ladder_of_its_own_with_what_there_is_time
     assert_eq!(
         trained["stages"],
         serde_json::json!({
-            "coarse": 6, "fine": 20, "fine_includes_coarse": false, "instance": 6, "half_size": 0.0, "batch": 2,
+            "coarse": 6, "fine": 20, "fine_includes_coarse": false, "instance": 6, "half_size": 0.0,
+            "reduction": 1, "whole_size": 0.0, "batch": 2,
         })
     );
     assert_eq!((&trained["rates"]["schedule_steps"], &trained["downscale"]), (&40.into(), &2.into()));

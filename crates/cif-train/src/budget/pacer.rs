@@ -10,27 +10,30 @@ pub const COARSE: f64 = 0.35;
 /// The same of an instance step: the instance pass on top.
 pub const INSTANCE: f64 = 1.25;
 
-/// First steps of a stage that cost less than its others.
+/// Costs of the steps of a stage relative to those in its middle, which cost 1: the first ones may cost less, and the last
+/// ones more, as they see images of other sizes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Cheaper {
-    /// Share of the steps.
-    pub share: f64,
-    /// Cost of one, relative to the others.
-    pub cost: f64,
+pub struct StepCosts {
+    /// Share of the first steps, and the cost of one.
+    pub first: (f64, f64),
+    /// Share of the last steps, and the cost of one.
+    pub last: (f64, f64),
 }
 
-impl Cheaper {
+impl StepCosts {
     /// Mean cost of all steps of the stage.
     #[must_use]
     pub fn mean(&self) -> f64 {
-        1.0 - self.share * (1.0 - self.cost)
+        1.0 - self.first.0 * (1.0 - self.first.1) - self.last.0 * (1.0 - self.last.1)
     }
 
     /// Cost of the first `done` of so many steps.
     #[must_use]
     pub fn cost_up_to(&self, done: u32, steps: u32) -> f64 {
-        let cheaper = (self.share * f64::from(steps)).floor().min(f64::from(done));
-        f64::from(done) - cheaper * (1.0 - self.cost)
+        let (done, steps) = (f64::from(done), f64::from(steps));
+        let last = (done - (steps - (self.last.0 * steps).floor())).max(0.0);
+        let first = (self.first.0 * steps).floor().min(done - last);
+        done - first * (1.0 - self.first.1) - last * (1.0 - self.last.1)
     }
 
     /// Cost of a step, from 1, of so many.
@@ -39,11 +42,18 @@ impl Cheaper {
         self.cost_up_to(step, steps) - self.cost_up_to(step.saturating_sub(1), steps)
     }
 
-    /// Steps of the stage where, after the first `done`, there is time for `more` that cost 1.
-    fn steps(&self, done: f64, more: f64) -> f64 {
-        let steps = (more + done * self.cost) / self.mean();
-        // No cheaper ones are left otherwise.
-        if done < self.share * steps { steps } else { done + more }
+    /// Steps of the stage where, after the first `done` of so many, there is time for `more` of those in its middle.
+    fn steps(&self, done: u32, steps: u32, more: f64) -> f64 {
+        let spent = self.cost_up_to(done, steps);
+        let done = f64::from(done);
+        // Each part of the stage keeps its share of the steps, unless it is over.
+        let all = (spent + more) / self.mean();
+        if done < self.first.0 * all {
+            return all;
+        }
+        let first = (self.first.0 * f64::from(steps)).floor().min(done);
+        let all = (spent + more + first * (1.0 - self.first.1)) / (1.0 - self.last.0 * (1.0 - self.last.1));
+        if done < (1.0 - self.last.0) * all { all } else { done + more / self.last.1 }
     }
 }
 
@@ -73,8 +83,8 @@ pub struct StageShare {
     pub stage: Stage,
     /// Expected time, any unit.
     pub weight: f64,
-    /// Its first steps, where these cost less.
-    pub cheaper: Cheaper,
+    /// What its steps cost.
+    pub costs: StepCosts,
 }
 
 /// Work to come that is no step of a stage.
@@ -86,18 +96,18 @@ pub struct OtherWork {
     pub has_fits: bool,
 }
 
-/// Weights of the stages for [`Pacer::enter`]: `steps` of each, in order, and which of them cost less.
+/// Weights of the stages for [`Pacer::enter`]: `steps` of each, in order, and what these cost.
 #[must_use]
-pub(crate) fn weights(steps: &[(Stage, u32, Cheaper)]) -> Vec<StageShare> {
+pub(crate) fn weights(steps: &[(Stage, u32, StepCosts)]) -> Vec<StageShare> {
     let cost = |stage| match stage {
         Stage::Coarse => COARSE,
         Stage::Instance => INSTANCE,
         _ => 1.0,
     };
-    let share = |&(stage, steps, cheaper): &(Stage, u32, Cheaper)| StageShare {
+    let share = |&(stage, steps, costs): &(Stage, u32, StepCosts)| StageShare {
         stage,
-        weight: f64::from(steps) * cost(stage) * cheaper.mean(),
-        cheaper,
+        weight: f64::from(steps) * cost(stage) * costs.mean(),
+        costs,
     };
     steps.iter().map(share).collect()
 }
@@ -112,9 +122,9 @@ pub struct Pacer {
     look: f64,
     /// Cost of the steps since then, relative to the last ones of the stage.
     since: f64,
-    /// First steps of the present stage that cost less.
-    cheaper: Cheaper,
-    /// Seconds per step of the present stage, of those that cost most.
+    /// What steps of the present stage cost.
+    costs: StepCosts,
+    /// Seconds per step of the present stage, of those in its middle.
     cost: Option<f64>,
 }
 
@@ -122,8 +132,8 @@ impl Pacer {
     /// Paces a run that has used nothing, or a part of its budget.
     #[must_use]
     pub fn new(budget: Budget) -> Self {
-        let cheaper = Cheaper::default();
-        Self { budget, deadline: budget.seconds, look: 0.0, since: 0.0, cheaper, cost: None }
+        let costs = StepCosts::default();
+        Self { budget, deadline: budget.seconds, look: 0.0, since: 0.0, costs, cost: None }
     }
 
     /// The budget.
@@ -155,14 +165,14 @@ impl Pacer {
         let left = (left - identity.min(0.2 * left)).max(0.0);
         self.deadline = used + if whole > 0.0 { left * mine / whole } else { left };
         (self.look, self.since) = (used, 0.0);
-        self.cheaper = stages.first().map_or(Cheaper::default(), |share| share.cheaper);
+        self.costs = stages.first().map_or(StepCosts::default(), |share| share.costs);
     }
 
     /// Steps that the present stage shall have in all, after `iteration` of the `steps` planned so far; none keeps these.
     /// The stage is over when that is no more than `iteration`.
     #[must_use]
     pub fn after_step(&mut self, iteration: u32, steps: u32, now: Seconds) -> Option<u32> {
-        self.since += self.cheaper.cost_of(iteration, steps);
+        self.since += self.costs.cost_of(iteration, steps);
         let used = self.budget.used(now);
         let left = self.deadline - used;
         let gap = LOOK_EVERY * self.budget.seconds;
@@ -179,7 +189,7 @@ impl Pacer {
         }
         let cost = self.cost.unwrap_or(newest);
         // At least one more: the deadline itself ends the stage.
-        let steps = self.cheaper.steps(f64::from(iteration), left / cost.max(1e-9));
+        let steps = self.costs.steps(iteration, steps, left / cost.max(1e-9));
         let more = (steps - f64::from(iteration)).ceil().clamp(1.0, f64::from(u32::MAX / 2));
         Some(iteration.saturating_add(more as u32))
     }
@@ -207,7 +217,7 @@ mod tests {
         let mut now = before;
         let at = |now: f64| Seconds { wall_s: 7.0 + now, cpu_s: 0.0 };
         let shares = [(Stage::Coarse, 0.02), (Stage::Fine, 0.78), (Stage::Instance, 0.2)]
-            .map(|(stage, weight)| StageShare { stage, weight, cheaper: Cheaper::default() });
+            .map(|(stage, weight)| StageShare { stage, weight, costs: StepCosts::default() });
         let mut done = Vec::new();
         for (k, share) in shares.iter().enumerate() {
             let start = now;
@@ -261,34 +271,45 @@ mod tests {
     }
 
     #[test]
-    fn first_steps_that_cost_less_are_as_many_as_their_share_says() {
+    fn first_and_last_steps_of_other_costs_are_as_many_as_their_shares_say() {
         let budget =
             Budget { seconds: 100.0, clock: BudgetClock::Wall, threads: 1, start: Seconds::default() };
-        for (share, cost) in [(0.0, 0.4), (0.4, 0.4), (0.7, 0.1), (1.0, 0.3)] {
-            let cheaper = Cheaper { share, cost };
+        let none = (0.0, 0.0);
+        let cases = [((0.0, 0.4), none), ((0.4, 0.4), none), ((0.7, 0.1), none), ((1.0, 0.3), none)];
+        let with_last =
+            [((0.4, 0.4), (0.2, 3.0)), (none, (0.3, 2.0)), ((0.4, 0.5), (0.5, 4.0)), (none, (1.0, 2.0))];
+        for (first, last) in cases.into_iter().chain(with_last) {
+            let costs = StepCosts { first, last };
             let mut pacer = Pacer::new(budget);
-            let stage = StageShare { stage: Stage::Fine, weight: 1.0, cheaper };
+            let stage = StageShare { stage: Stage::Fine, weight: 1.0, costs };
             let mut now = Seconds::default();
             pacer.enter(&[stage], OtherWork::default(), now);
-            let (mut iteration, mut steps, mut cheap, mut least) = (0, 700, 0, u32::MAX);
+            let (mut iteration, mut steps, mut of_kinds, mut least) = (0, 700, [0, 0], u32::MAX);
             while iteration < steps {
                 iteration += 1;
-                let is_cheaper = f64::from(iteration) <= share * f64::from(steps);
-                cheap += u32::from(is_cheaper);
-                now.wall_s += 0.1 * if is_cheaper { cost } else { 1.0 };
+                let is_first = f64::from(iteration) <= first.0 * f64::from(steps);
+                let is_last = iteration > steps - (last.0 * f64::from(steps)) as u32;
+                of_kinds[0] += u32::from(is_first);
+                of_kinds[1] += u32::from(is_last);
+                now.wall_s += 0.1
+                    * match (is_first, is_last) {
+                        (true, _) => first.1,
+                        (_, true) => last.1,
+                        _ => 1.0,
+                    };
                 steps = pacer.after_step(iteration, steps, now).unwrap_or(steps);
                 if now.wall_s > 3.0 {
                     least = least.min(steps);
                 }
             }
-            let expected = 99.5 / (0.1 * cheaper.mean());
-            assert!((f64::from(steps) / expected - 1.0).abs() < 0.01, "{steps} of {expected}: {cheaper:?}");
-            assert!(
-                (f64::from(cheap) / f64::from(steps) - share).abs() < 0.02,
-                "{cheap} of {steps}: {cheaper:?}"
-            );
+            let expected = 99.5 / (0.1 * costs.mean());
+            assert!((f64::from(steps) / expected - 1.0).abs() < 0.01, "{steps} of {expected}: {costs:?}");
+            for (count, share) in of_kinds.into_iter().zip([first.0, last.0]) {
+                let found = f64::from(count) / f64::from(steps);
+                assert!((found - share).abs() < 0.02, "{count} of {steps}: {costs:?}");
+            }
             // Known from the start, not when steps become dear.
-            assert!(f64::from(least) > 0.97 * expected, "{least} of {expected}: {cheaper:?}");
+            assert!(f64::from(least) > 0.97 * expected, "{least} of {expected}: {costs:?}");
         }
     }
 

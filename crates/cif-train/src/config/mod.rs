@@ -17,7 +17,7 @@ pub use options::{
     Ablation, DensifyRule, Excess, HeadName, InstanceGeometry, LabelShares, Normalisation, ObjectMotion,
     OccupancyStart, Preset, ScaleCorrection, WeakSet, Weakness,
 };
-pub use validate::ConfigError;
+pub use validate::{ConfigError, MAX_REDUCTION};
 
 /// Settings of a run. Every table and key may be left out of a file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -89,6 +89,12 @@ pub struct StagesConfig {
     /// `paper`; where no masks guide what moves, coarse steps see them too. Images whose shorter side has less than 128
     /// pixels stay whole.
     pub half_size: f32,
+    /// Reduction of the images that a run works on, but for its last fine steps: 1 to 16, or 0, the default, by powers of
+    /// two until they have no more than 32 pixels for each of `densify.max_gaussians`; 1 in `paper`.
+    pub reduction: u32,
+    /// Share of the fine steps, the last ones, that see whole images in a run that works on reduced ones, [0, 1], default
+    /// 0.05.
+    pub whole_size: f32,
     /// Views per step, 1 to 1024, default 1 (A27: all stages alike).
     pub batch: u32,
 }

@@ -10,13 +10,14 @@ fn removed() -> [(&'static str, Value); 2] {
 }
 
 /// Settings that there were not, with the value that runs went by.
-fn added() -> [(&'static str, Value); 5] {
+fn added() -> [(&'static str, Value); 6] {
     [
         ("/resample/weakness", "occupancy".into()),
         ("/model/triangulate", false.into()),
         ("/identity/share_rounds", 0.into()),
         ("/densify/rule", "gradient".into()),
         ("/stages/half_size", 0.into()),
+        ("/stages/reduction", 1.into()),
     ]
 }
 
@@ -67,11 +68,13 @@ mod tests {
         json["resample"].as_object_mut().unwrap().remove("weakness");
         json["densify"].as_object_mut().unwrap().remove("rule");
         json["stages"].as_object_mut().unwrap().remove("half_size");
+        json["stages"].as_object_mut().unwrap().remove("reduction");
         let former = TrainConfig::recorded(json.clone()).unwrap();
         assert_eq!(
             (former.resample.weakness, former.densify.rule, former.stages.half_size),
             (Weakness::Occupancy, DensifyRule::Gradient, 0.0)
         );
+        assert_eq!(former.stages.reduction, 1);
         json["stages"]["tile_share"] = 0.5.into();
         let error = TrainConfig::recorded(json).unwrap_err();
         assert!(error.contains("stages.tile_share = 0.5"), "{error}");

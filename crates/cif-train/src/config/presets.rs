@@ -60,6 +60,8 @@ fn paper(layout: Layout) -> TrainConfig {
         fine_includes_coarse: false,
         instance: 3_000,
         half_size: 0.0,
+        reduction: 1,
+        whole_size: 0.0,
         batch: 1,
     };
     config.model = ModelConfig {
@@ -197,6 +199,8 @@ impl Default for StagesConfig {
             fine_includes_coarse: false,
             instance: 1_000,
             half_size: 0.4,
+            reduction: 0,
+            whole_size: 0.05,
             batch: 1,
         }
     }

@@ -4,6 +4,9 @@ use thiserror::Error;
 
 use super::{Ablation, TrainConfig};
 
+/// Largest `stages.reduction`.
+pub const MAX_REDUCTION: u32 = 16;
+
 /// Most views per step: a step holds the images of all of its views in memory.
 const MAX_BATCH: u32 = 1024;
 
@@ -56,6 +59,18 @@ impl TrainConfig {
         within(
             "stages.half_size",
             stages.half_size,
+            0.0..=1.0,
+            "expected a share of the fine steps, 0 to 1",
+        )?;
+        check(
+            stages.reduction <= MAX_REDUCTION,
+            "stages.reduction",
+            stages.reduction,
+            "expected 1 to 16, or 0 (automatic)",
+        )?;
+        within(
+            "stages.whole_size",
+            stages.whole_size,
             0.0..=1.0,
             "expected a share of the fine steps, 0 to 1",
         )?;

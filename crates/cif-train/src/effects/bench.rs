@@ -109,7 +109,7 @@ impl Bench<'_> {
             JudgedErrors { all: SquaredError::default(), of_labels: vec![SquaredError::default(); labels] };
         let channels = Channels { depth: false, instances: false };
         let mut truth = truth.iter();
-        let views = Views { frames: &frames, settings, channels };
+        let views = Views { frames: &frames, whole: false, settings, channels };
         draw(self.engine, state, self.simd, trial, views, &mut |rendered| {
             let Some(data) = truth.next() else { return };
             for pixel in held_out(data.image.width, data.image.height) {

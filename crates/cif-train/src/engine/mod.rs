@@ -19,6 +19,7 @@ pub(crate) mod validation;
 use std::any::Any;
 use std::time::Duration;
 
+use cif_dataset::Dataset;
 use cif_field::Field;
 use cif_render::cpu::IdentityCounts;
 use cif_render::{Channels, RenderSettings, RenderedImage};
@@ -45,8 +46,17 @@ pub(crate) enum Changed {
 pub(crate) struct Views<'a> {
     /// Indices in the capture.
     pub frames: &'a [usize],
+    /// At the size of the capture, instead of that which is worked on.
+    pub whole: bool,
     pub settings: &'a RenderSettings,
     pub channels: Channels,
+}
+
+impl Views<'_> {
+    /// The capture that the frames are of, at their size.
+    pub(crate) fn dataset<'s>(&self, state: &'s State) -> &'s Dataset {
+        if self.whole { state.capture() } else { &state.dataset }
+    }
 }
 
 /// Computes the steps of a run.

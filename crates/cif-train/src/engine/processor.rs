@@ -325,7 +325,7 @@ impl Engine for Processor {
     ) -> Result<(), TrainError> {
         for index in views.frames {
             state.phases.check()?;
-            let frame = &state.dataset.frames[*index];
+            let frame = &views.dataset(state).frames[*index];
             let field = trial.unwrap_or(&state.field);
             let by_values = state.started_head().filter(|_| views.channels.instances);
             let channels =

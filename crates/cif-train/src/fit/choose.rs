@@ -1,9 +1,9 @@
 //! Which settings fit a budget: steps, Gaussians and, where nothing else helps, resolution.
 
 use super::Calibration;
-use crate::budget::{COARSE, FITS, INSTANCE};
+use crate::budget::{COARSE, FITS, INSTANCE, StepCosts};
 use crate::config::TrainConfig;
-use crate::schedule::may_halve;
+use crate::working_size;
 
 /// Mean Gaussians of the fine stage as a share of the most.
 const MEAN_GAUSSIANS: f64 = 0.8;
@@ -66,14 +66,18 @@ fn expected_s(config: &TrainConfig, calibration: &Calibration, work: Workload, r
     let most = f64::from(config.densify.max_gaussians);
     // Densification may start with more than it may add up to.
     let mean = (MEAN_GAUSSIANS * most).max(calibration.gaussians.min(most as usize) as f64);
-    let few = calibration.step_s(calibration.gaussians.min(most as usize) as f64, reduction);
-    let [width, height] = calibration.image_size.map(|side| side / reduction);
-    let half_size = if may_halve(width, height) { f64::from(config.stages.half_size) } else { 0.0 };
+    let size = calibration.image_size.map(|side| side / reduction);
+    let working = working_size::of_size(size, config);
+    let StepCosts { first: (halved, _), last: (whole, _) } =
+        working_size::step_costs(size.map(|side| side / working), working, &config.stages);
+    let few = calibration.step_s(calibration.gaussians.min(most as usize) as f64, reduction * working);
     let fine = f64::from(config.fine_iterations())
-        * (half_size * calibration.step_s(mean, 2 * reduction)
-            + (1.0 - half_size) * calibration.step_s(mean, reduction));
+        * (halved * calibration.step_s(mean, 2 * reduction * working)
+            + whole * calibration.step_s(mean, reduction)
+            + (1.0 - halved - whole) * calibration.step_s(mean, reduction * working));
     let coarse = f64::from(config.stages.coarse) * few * if work.is_dynamic { COARSE } else { 1.0 };
-    let instance = f64::from(config.stages.instance) * INSTANCE * calibration.step_s(most, reduction);
+    let instance =
+        f64::from(config.stages.instance) * INSTANCE * calibration.step_s(most, reduction * working);
     coarse + fine + if work.has_instances { instance } else { 0.0 }
 }
 
@@ -220,7 +224,8 @@ mod tests {
 
     #[test]
     fn images_are_reduced_only_when_there_is_no_other_way() {
-        let base = TrainConfig::default();
+        let mut base = TrainConfig::default();
+        base.stages.reduction = 1;
         let slow = Calibration { step_s: 0.5, pixel_share: 0.9, image_size: [1352, 1014], ..MEASURED };
         let choice = choose(&base, &slow, WORK, 90.0);
         assert!(choice.config.downscale >= Some(2), "{:?}", choice.config.downscale);
@@ -228,6 +233,11 @@ mod tests {
         let kept = choose(&base, &slow, Workload { may_reduce: false, ..WORK }, 90.0);
         assert_eq!(kept.config.downscale, None);
         assert!(kept.config.stages.fine < choice.config.stages.fine);
+        // Few Gaussians make do with smaller images but for the last steps.
+        base.stages.reduction = 0;
+        let worked_on = choose(&base, &slow, Workload { may_reduce: false, ..WORK }, 90.0);
+        assert!(worked_on.config.stages.fine > 2 * kept.config.stages.fine, "{:?}", worked_on.config.stages);
+        assert!(worked_on.expected_s <= 91.0 && worked_on.base_s < 0.5 * kept.base_s);
     }
 
     #[test]

@@ -7,6 +7,7 @@ use super::effect::{Decision, Effect, EffectKind, Extent};
 use super::evidence::Evidence;
 use crate::config::{ObjectMotion, TrainConfig};
 use crate::trainer::automatic_time_nodes;
+use crate::working_size;
 
 /// Share of changed pixels up to which a fixed camera sees nothing move.
 const STATIC_CHANGE: f64 = 5e-4;
@@ -45,6 +46,7 @@ pub(super) fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoi
         effects.extend(plan.shape());
         effects.push(plan.time_planes());
     }
+    effects.push(plan.image_size());
     effects.extend(plan.view_dependence());
     let instances = plan.instances(has_masks);
     let has_instances = instances.decision != Decision::Off;
@@ -155,6 +157,27 @@ impl Plan<'_> {
             evidence: format!("{} times{}", self.found.times, speed(self.found)),
             cost: format!("{:.1} MB", time_plane_megabytes(self.config, nodes)),
             flag: "--set model.time_resolution=N".to_owned(),
+        }
+    }
+
+    fn image_size(&self) -> Effect {
+        let ([width, height], stages) = (self.found.image_size, &self.config.stages);
+        let reduction = working_size::of_size([width, height], self.config);
+        let [small, low] = working_size::reduced_size([width, height], reduction);
+        let per_gaussian =
+            f64::from(width) * f64::from(height) / f64::from(self.config.densify.max_gaussians);
+        Effect {
+            effect: EffectKind::ImageSize,
+            decision: Decision::Value(match reduction {
+                1 => "whole".to_owned(),
+                _ => format!(
+                    "{small} x {low}, and whole in the last {:.0} % of the fine steps",
+                    100.0 * stages.whole_size
+                ),
+            }),
+            evidence: format!("{width} x {height} pixels, {per_gaussian:.1} for each Gaussian of a full set"),
+            cost: "steps take about as long as pixels are many where these are large".to_owned(),
+            flag: "--set stages.reduction=N".to_owned(),
         }
     }
 

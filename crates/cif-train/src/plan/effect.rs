@@ -11,6 +11,8 @@ pub enum EffectKind {
     Shape,
     /// Nodes of the time planes.
     TimePlanes,
+    /// Size of the images that are worked on.
+    ImageSize,
     /// Spherical harmonics above degree 0.
     ViewDependence,
     /// Identities, occupancy, calibration, resampling.
@@ -58,6 +60,7 @@ impl EffectKind {
             Self::Motion => "motion",
             Self::Shape => "shape",
             Self::TimePlanes => "time-planes",
+            Self::ImageSize => "image-size",
             Self::ViewDependence => "view-dependence",
             Self::Instances => "instances",
             Self::Appearing => "appearing",

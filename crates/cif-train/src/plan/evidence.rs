@@ -15,6 +15,7 @@ use crate::phases::Phases;
 use crate::sightings::Sightings;
 use crate::switches::{Seen, put_right, switches};
 use crate::tracks::{Observation, misfits, travels};
+use crate::working_size;
 
 /// Masks that are looked at, spread evenly over the training frames.
 const MASKS: usize = 64;
@@ -61,6 +62,8 @@ pub(super) struct Evidence {
     pub footprint_ratio: f64,
     /// Largest angle between directions from which training cameras see the middle of the points, degrees.
     pub view_angle: f64,
+    /// Size of the largest training image, pixels.
+    pub image_size: [u32; 2],
     /// Training frames whose lens is removed.
     pub lenses: usize,
     /// True when images carry alpha.
@@ -113,6 +116,7 @@ impl Evidence {
             exposures: exposures(dataset, &cameras, phases)?,
             footprint_ratio: footprint_ratio(dataset, &training),
             view_angle: view_angle(dataset, &training),
+            image_size: working_size::captured(dataset),
             lenses: training.iter().filter(|(_, frame)| !frame.lens.is_identity()).count(),
             has_alpha: dataset.has_alpha,
         })

@@ -131,8 +131,8 @@ fn set(kind: EffectKind, extent: Extent, config: &mut TrainConfig) {
         EffectKind::ExposureInTime => config.effects.exposure_in_time = extent != Extent::Off,
         EffectKind::Physics => config.effects.physics = extent != Extent::Off,
         EffectKind::Antialiasing => config.antialiased = extent != Extent::Off,
-        // Told, and set elsewhere: by the number of times, by the capture, by the background.
-        EffectKind::TimePlanes | EffectKind::Lens | EffectKind::Background => {}
+        // Set elsewhere: by the number of times, the size of images, the capture, the background.
+        EffectKind::TimePlanes | EffectKind::ImageSize | EffectKind::Lens | EffectKind::Background => {}
     }
 }
 

@@ -17,6 +17,7 @@ fn found() -> Evidence {
         exposures: None,
         footprint_ratio: 1.3,
         view_angle: 50.0,
+        image_size: [256, 192],
         lenses: 0,
         has_alpha: false,
     }
@@ -117,6 +118,7 @@ fn every_effect_says_why_and_what_decides_otherwise() {
             "motion",
             "shape",
             "time-planes",
+            "image-size",
             "view-dependence",
             "instances",
             "appearing",
@@ -130,7 +132,7 @@ fn every_effect_says_why_and_what_decides_otherwise() {
             "physics"
         ]
     );
-    assert_eq!(json["effects"][4]["decision"], "on");
+    assert_eq!(json["effects"][5]["decision"], "on");
 }
 
 #[test]

@@ -1,13 +1,55 @@
 //! How long the rest of a run takes, by what its steps and fits took so far.
 
+use std::time::Duration;
+
 use super::Trainer;
 use crate::budget::{COARSE, IDENTITY_STEPS_PER_FRAME, INSTANCE};
+use crate::config::DensifyRule;
 use crate::phase::Phase;
+use crate::schedule::{Due, may_halve};
 use crate::stage::Stage;
+use crate::times::StepTimes;
+use crate::working_size::PIXEL_SHARE;
 
 /// Time of a fit of an object that travels, of that of one that turns out to rest: the first has about 32 000 steps, the
 /// second 4 700, each in two sizes of one capture.
 const TRAVELS: f64 = 7.0;
+
+/// Steps of a stage that are looked at for what all of it costs.
+const SAMPLES: u32 = 200;
+
+/// Shares of a step that grow with pixels, and with neither these nor Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Shares {
+    pixels: f64,
+    fixed: f64,
+}
+
+impl Default for Shares {
+    /// Where parts of steps are not timed, as on GPUs.
+    fn default() -> Self {
+        Self { pixels: PIXEL_SHARE, fixed: 0.0 }
+    }
+}
+
+impl Shares {
+    /// Of the steps between two times; `None` where there were none, or their parts were not timed.
+    fn of(now: &StepTimes, since: &StepTimes) -> Option<Self> {
+        let pixels = |of: &StepTimes| of.render.rasterize + of.render.rasterize_backward + of.losses;
+        let fixed = |of: &StepTimes| of.optimiser_planes + of.optimiser_mlp;
+        let between = |part: fn(&StepTimes) -> Duration| part(now).saturating_sub(part(since)).as_secs_f64();
+        let total = between(|of| of.total);
+        let pixels = between(pixels);
+        (total > 0.0 && pixels > 0.0)
+            .then(|| Self { pixels: (pixels / total).min(1.0), fixed: (between(fixed) / total).min(1.0) })
+    }
+
+    /// Cost of a step with so many times the pixels and Gaussians, relative to those that were timed.
+    fn cost(&self, pixels: f64, gaussians: f64) -> f64 {
+        let rows = (1.0 - self.pixels - self.fixed).max(0.0);
+        self.pixels * pixels + self.fixed + rows * gaussians
+    }
+}
 
 impl Trainer {
     /// Travelling objects that are not fitted yet.
@@ -21,11 +63,12 @@ impl Trainer {
 
     /// Estimated seconds to the end of the run, within a stage whose steps are done at a rate per second: the budget's
     /// where there is one, else by steps, by the frames that identities are estimated from, and by the objects that are
-    /// fitted between the coarse and the fine stage.
-    pub(super) fn eta_s(&self, stage: Stage, rate: f64) -> f64 {
+    /// fitted between the coarse and the fine stage. `since`: times of all steps when the rate began to be counted.
+    pub(super) fn eta_s(&self, stage: Stage, rate: f64, since: &StepTimes) -> f64 {
         if let Some(left_s) = self.budget_left_s() {
             return left_s;
         }
+        let shares = Shares::of(&self.state.times, since).unwrap_or_default();
         let cost = |stage: Stage| match stage {
             Stage::Coarse if self.stages.is_dynamic => COARSE,
             Stage::Instance => INSTANCE,
@@ -33,16 +76,61 @@ impl Trainer {
         };
         let all = |of: Stage| self.stages.iterations(&self.state.config, of);
         let done = |of: Stage| if of == stage { self.state.progress.iteration } else { 0 };
-        let last = self.cheaper(stage).cost_of(done(stage).max(1), all(stage)) * cost(stage);
-        let step_s = 1.0 / (rate * last).max(1e-9);
+        let gaussians = self.state.field.gaussians.len() as f64;
+        let last = self.pixels_of_step(stage, done(stage).max(1));
+        let cost_of = |of: Stage, step: u32, pixels: f64| {
+            let more = self.gaussians_at(of, step) / gaussians.max(1.0);
+            shares.cost(pixels / last, more) * cost(of) / cost(stage)
+        };
+        // Costs change slowly but for a few steps, so that some tell of all.
         let left = |of: Stage| {
-            let (cheaper, steps) = (self.cheaper(of), all(of).max(done(of)));
-            (cheaper.cost_up_to(steps, all(of)) - cheaper.cost_up_to(done(of), all(of))) * cost(of)
+            let (done, all) = (done(of), all(of));
+            let every = (all.saturating_sub(done)).div_ceil(SAMPLES).max(1);
+            (done + 1..=all)
+                .step_by(every as usize)
+                .map(|step| {
+                    let pixels = self.pixels_of_step(of, step);
+                    cost_of(of, step, pixels) * f64::from(every.min(all + 1 - step))
+                })
+                .sum::<f64>()
         };
         let stages = [Stage::Coarse, Stage::Fine, Stage::Instance].into_iter().filter(|of| *of >= stage);
-        let identity = IDENTITY_STEPS_PER_FRAME * self.frames_of_identities(stage) as f64;
+        let identity = IDENTITY_STEPS_PER_FRAME
+            * self.frames_of_identities(stage) as f64
+            * cost_of(Stage::Fine, all(Stage::Fine), 1.0);
         let fits_s = if stage == Stage::Coarse { self.fits_s() } else { 0.0 };
-        (stages.map(left).sum::<f64>() + identity) * step_s + fits_s
+        (stages.map(left).sum::<f64>() + identity) / rate.max(1e-9) + fits_s
+    }
+
+    /// Pixels of the images of a step, relative to those that are worked on.
+    fn pixels_of_step(&self, stage: Stage, step: u32) -> f64 {
+        let at = self.moment(stage, step, 0);
+        let reduction = f64::from(self.state.config.stages.reduction.max(1));
+        if at.has(Due::WholeImages) {
+            return reduction * reduction;
+        }
+        let camera = &self.state.dataset.frames[self.state.frames.index(0)].camera;
+        if at.has(Due::HalveImages) && may_halve(camera.width, camera.height) { 0.25 } else { 1.0 }
+    }
+
+    /// Gaussians at a step to come: they grow by equal factors until their set is full, where they are added by a budget.
+    fn gaussians_at(&self, stage: Stage, step: u32) -> f64 {
+        let (config, progress) = (&self.state.config, &self.state.progress);
+        let now = self.state.field.gaussians.len() as f64;
+        let most = f64::from(config.densify.max_gaussians);
+        let fine = self.stages.iterations(config, Stage::Fine);
+        let full = f64::from(config.densify.full_at) * f64::from(fine.min(config.densify.until));
+        let grows = config.densify.rule == DensifyRule::Error && most > now;
+        // What the coarse stage adds is little.
+        if !grows || progress.stage > Stage::Fine || stage == Stage::Coarse || full < 1.0 {
+            return now;
+        }
+        let done = if progress.stage == Stage::Fine { f64::from(progress.iteration) } else { 0.0 };
+        let way = match stage {
+            Stage::Fine if done < full => ((f64::from(step) - done) / (full - done)).clamp(0.0, 1.0),
+            _ => 1.0,
+        };
+        now * (most / now.max(1.0)).powf(way)
     }
 
     /// Estimated seconds of the fits to come, by those of objects that were tried before; 0 where none was.
@@ -52,5 +140,61 @@ impl Trainer {
         let tried = others as f64 + TRAVELS * self.state.objects.moving_count() as f64;
         let spent = self.state.phases.spent(Phase::Search).wall_s;
         if tried > 0.0 { TRAVELS * self.objects_to_fit() as f64 * spent / tried } else { 0.0 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::guard_tests::support::{Scene, capture, small_config};
+    use super::*;
+
+    #[test]
+    fn costs_grow_with_what_the_parts_of_steps_grow_with() {
+        let shares = Shares { pixels: 0.5, fixed: 0.2 };
+        assert!((shares.cost(1.0, 1.0) - 1.0).abs() < 1e-12);
+        assert!((shares.cost(4.0, 2.0) - (2.0 + 0.2 + 0.6)).abs() < 1e-12);
+        let since = StepTimes { total: Duration::from_secs(1), ..StepTimes::default() };
+        let mut now = StepTimes { total: Duration::from_secs(5), ..since };
+        assert_eq!(Shares::of(&now, &since), None, "parts are not timed");
+        (now.losses, now.optimiser_mlp) = (Duration::from_secs(1), Duration::from_secs(2));
+        assert_eq!(Shares::of(&now, &since), Some(Shares { pixels: 0.25, fixed: 0.5 }));
+        assert_eq!(Shares::of(&since, &since), None);
+    }
+
+    #[test]
+    fn the_rest_of_a_run_counts_sizes_and_gaussians_to_come() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), Scene { times: 3, views: 4, larger: 8, ..Scene::default() });
+        let mut config = small_config();
+        let stages = &mut config.stages;
+        (stages.coarse, stages.fine, stages.instance) = (0, 100, 0);
+        (stages.half_size, stages.reduction, stages.whole_size) = (0.4, 2, 0.2);
+        let mut trainer = Trainer::new(dataset, config).unwrap();
+        trainer.enter(Stage::Fine).unwrap();
+        let now = trainer.field().gaussians.len() as f64;
+        let densify = &mut trainer.state.config.densify;
+        (densify.rule, densify.until, densify.full_at) = (DensifyRule::Error, 80, 0.5);
+        densify.max_gaussians = 4 * now as u32;
+        let at = [1, 40, 41, 80, 81, 100].map(|step| trainer.pixels_of_step(Stage::Fine, step));
+        assert_eq!(at, [0.25, 0.25, 1.0, 1.0, 4.0, 4.0]);
+        let at =
+            [0, 20, 40, 90].map(|step| (trainer.gaussians_at(Stage::Fine, step) / now * 1e3).round() / 1e3);
+        assert_eq!(at, [1.0, 2.0, 4.0, 4.0]);
+        assert_eq!(trainer.gaussians_at(Stage::Instance, 1), 4.0 * now);
+        trainer.state.config.densify.rule = DensifyRule::Gradient;
+        assert_eq!(trainer.gaussians_at(Stage::Fine, 90), now, "nobody knows");
+        // A step on half-size images takes a second; parts are not timed.
+        let eta_s = trainer.eta_s(Stage::Fine, 1.0, &StepTimes::default());
+        let cost = |pixels: f64| Shares::default().cost(4.0 * pixels, 1.0);
+        let identity = IDENTITY_STEPS_PER_FRAME * trainer.frames_of_identities(Stage::Fine) as f64;
+        let expected = 40.0 + (40.0 + identity) * cost(1.0) + 20.0 * cost(4.0);
+        assert!((eta_s / expected - 1.0).abs() < 1e-6, "{eta_s} {expected}");
+        // One of the size that is worked on takes half a second.
+        trainer.state.progress.iteration = 80;
+        let eta_s = trainer.eta_s(Stage::Fine, 2.0, &StepTimes::default());
+        assert!(
+            (eta_s / (10.0 * Shares::default().cost(4.0, 1.0) + 0.5 * identity) - 1.0).abs() < 1e-6,
+            "{eta_s}"
+        );
     }
 }

@@ -100,7 +100,7 @@ impl Trainer {
             .map(|k| {
                 self.check_stop()?;
                 let index = held_out[k * held_out.len() / count];
-                Ok((index, self.state.dataset.load_frame(index, self.state.config.background)?))
+                Ok((index, self.state.capture().load_frame(index, self.state.config.background)?))
             })
             .collect::<Result<Vec<_>, TrainError>>()?;
         let scores = self.score(&frames)?;
@@ -141,7 +141,7 @@ impl Trainer {
                 self.state.progress.curve.frame_names = indices.iter().map(name).collect();
                 let load = |index| {
                     self.check_stop()?;
-                    Ok((index, self.state.dataset.load_frame(index, self.state.config.background)?))
+                    Ok((index, self.state.capture().load_frame(index, self.state.config.background)?))
                 };
                 indices.into_iter().map(load).collect::<Result<_, TrainError>>()?
             }
@@ -181,7 +181,7 @@ impl Trainer {
         };
         let (mut psnrs, mut ssims, mut labels) = (Vec::new(), Vec::new(), Vec::new());
         let indices: Vec<usize> = frames.iter().map(|(index, _)| *index).collect();
-        let views = Views { frames: &indices, settings: &settings, channels };
+        let views = Views { frames: &indices, whole: true, settings: &settings, channels };
         let mut truths = frames.iter();
         let phases = self.state.phases.clone();
         self.draw(None, views, &mut |rendered| {

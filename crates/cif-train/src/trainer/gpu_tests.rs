@@ -463,6 +463,7 @@ pub(super) fn drawn(trainer: &mut Trainer, trial: Option<&Field>) -> Vec<Rendere
         ..trainer.state.color_settings()
     };
     let views = Views {
+        whole: false,
         frames: &[0, 1, 3, 4],
         settings: &settings,
         channels: Channels { depth: true, instances: settings.instances.is_some() },

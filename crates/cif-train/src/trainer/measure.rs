@@ -44,7 +44,7 @@ impl Trainer {
         assert!(stage.has_steps(), "the {stage} stage has no steps");
         config.validate()?;
         // Steps like those at the end of their stage.
-        config.stages.half_size = 0.0;
+        (config.stages.half_size, config.stages.reduction) = (0.0, 1);
         let measured_frames = MeasuredFrames::withhold(&mut dataset, &config);
         let is_trained = scene.is_some();
         let mut field = match scene {

@@ -111,6 +111,7 @@ use crate::state::State;
 use crate::step::StepLoss;
 use crate::stop::Start;
 use crate::times::{StepTimes, Work};
+use crate::working_size::{self, Whole};
 
 /// Names that a warning lists at most.
 const MOST_NAMES: usize = 8;
@@ -219,15 +220,25 @@ impl Trainer {
 
     /// Everything but the state of the optimiser; frames of `measured_frames` are no training frames of the capture.
     fn assemble(
-        Start { dataset, phases }: Start,
+        Start { dataset: capture, phases }: Start,
         measured_frames: MeasuredFrames,
-        config: TrainConfig,
+        mut config: TrainConfig,
         mut field: Field,
         progress: Option<Progress>,
     ) -> Result<Self, TrainError> {
         if let Some(tracks) = field.tracks.as_ref().filter(|tracks| !tracks.is_rigid()) {
             return Err(TrainError::RecordedMotion { groups: tracks.groups.len() });
         }
+        config.stages.reduction = working_size::reduction(&capture, &config);
+        let reduction = config.stages.reduction;
+        let inputs = resume::inputs_of(&capture);
+        // Gaussians of another scene were trained on its images.
+        field.record.images.get_or_insert_with(|| serde_json::json!(TrainedImages::of(&capture, &inputs)));
+        let is_reduced = reduction > 1;
+        let (dataset, capture) = match is_reduced {
+            true => (working_size::reduced(capture.clone(), reduction), Some(capture)),
+            false => (capture, None),
+        };
         let budget = u64::from(config.frame_memory_mib) << 20;
         let maps = match config.head.name {
             HeadName::LangSplat => cif_dataset::feature_maps(&dataset, Path::new(&config.head.maps))?,
@@ -264,9 +275,8 @@ impl Trainer {
             0.0 => field.record.drawing.near.unwrap_or_else(|| near::automatic(&dataset)),
             near => near,
         };
-        let inputs = resume::inputs_of(&dataset);
-        // Gaussians of another scene were trained on its images.
-        field.record.images.get_or_insert_with(|| serde_json::json!(TrainedImages::of(&dataset, &inputs)));
+        let training = (0..frames.len()).map(|k| frames.index(k)).collect();
+        let whole = capture.map(|capture| Whole::of(capture, training, config.background));
         let n = field.gaussians.len();
         let simd = SimdLevel::Auto;
         Ok(Self {
@@ -303,6 +313,7 @@ impl Trainer {
                 gradients: Gradients::zeros(&field),
                 times: StepTimes::default(),
                 dataset,
+                whole,
                 config,
                 near,
                 frames,
@@ -362,6 +373,18 @@ impl Trainer {
             let message = "one training frame: depth and occluded parts are not determined";
             self.messages.push(TrainEvent::warning(message));
         }
+        if self.state.whole.is_some() {
+            let size = working_size::captured(self.state.capture());
+            let [width, height] = working_size::reduced_size(size, self.state.config.stages.reduction);
+            self.messages.push(TrainEvent::note(format!(
+                "images of {} x {} pixels are worked on at {width} x {height}, but for the last {:.0} % of the fine \
+                 steps: {} Gaussians show no more (stages.reduction = 1 takes whole ones)",
+                size[0],
+                size[1],
+                100.0 * self.state.config.stages.whole_size,
+                self.state.config.densify.max_gaussians
+            )));
+        }
         let not_kept = self.state.frames.not_kept();
         if not_kept > 0 {
             self.messages.push(TrainEvent::note(format!(
@@ -419,7 +442,7 @@ impl Trainer {
     /// The capture.
     #[must_use]
     pub fn dataset(&self) -> &Dataset {
-        &self.state.dataset
+        self.state.capture()
     }
 
     /// Stage of the run.

@@ -7,15 +7,15 @@
 use serde_json::{Value, json};
 
 use super::Trainer;
-use crate::budget::{Budget, Cheaper, FITS, OtherWork, Pacer, REHEARSAL, TRIALS, weights};
+use crate::budget::{Budget, FITS, OtherWork, Pacer, REHEARSAL, StepCosts, TRIALS, weights};
 use crate::curve::{CurvePoint, Targets};
 use crate::error::TrainError;
 use crate::phase::Phase;
 use crate::phases::Deadline;
 use crate::progress::Goals;
-use crate::schedule::{HALF_SIZE, may_halve};
 use crate::stage::Stage;
 use crate::state::State;
+use crate::working_size;
 
 /// Points of a stage before its trend is believed.
 const POINTS_OF_TREND: usize = 6;
@@ -88,13 +88,13 @@ impl Trainer {
 
     /// Gives a stage that begins, or goes on, its deadline.
     pub(super) fn pace_stage(&mut self, stage: Stage) {
-        let steps: Vec<(Stage, u32, Cheaper)> = [Stage::Coarse, Stage::Fine, Stage::Instance]
+        let steps: Vec<(Stage, u32, StepCosts)> = [Stage::Coarse, Stage::Fine, Stage::Instance]
             .into_iter()
             .filter(|other| *other >= stage)
             .map(|other| (other, self.stages.iterations(&self.state.config, other)))
             .map(|(other, steps)| {
                 let done = if other == stage { self.state.progress.iteration } else { 0 };
-                (other, steps.saturating_sub(done), self.cheaper(other))
+                (other, steps.saturating_sub(done), self.step_costs(other))
             })
             .filter(|(other, steps, _)| *steps > 0 || *other == stage)
             .collect();
@@ -107,15 +107,18 @@ impl Trainer {
         pacing.pacer.enter(&weights(&steps), other, now);
     }
 
-    /// First steps of a stage that cost less than the others, as they see smaller images.
-    pub(super) fn cheaper(&self, stage: Stage) -> Cheaper {
+    /// Costs of the steps of a stage, of which the first and the last see images of other sizes.
+    pub(super) fn step_costs(&self, stage: Stage) -> StepCosts {
         let State { dataset, frames, config, .. } = &self.state;
         let camera = &dataset.frames[frames.index(0)].camera;
-        let share = match stage {
-            Stage::Fine if may_halve(camera.width, camera.height) => config.stages.half_size,
-            _ => 0.0,
-        };
-        Cheaper { share: f64::from(share), cost: HALF_SIZE }
+        match stage {
+            Stage::Fine => working_size::step_costs(
+                [camera.width, camera.height],
+                config.stages.reduction,
+                &config.stages,
+            ),
+            _ => StepCosts::default(),
+        }
     }
 
     /// Frames that identity estimation passes over behind a stage.

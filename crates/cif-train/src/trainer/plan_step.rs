@@ -53,11 +53,16 @@ impl Trainer {
 
     /// Has the views from a position of a stage on decoded while the present step is computed, where memory has no room
     /// for all.
-    fn expect_views(&mut self, stage: Stage, position: u64) {
-        if self.state.frames.not_kept() > 0 {
-            let coming: Vec<usize> =
-                (position..).take(MOST_AHEAD).map(|position| self.view_at(stage, position)).collect();
-            self.state.frames.expect(coming);
+    fn expect_views(&mut self, stage: Stage, position: u64, whole: bool) {
+        let whole = whole && self.state.whole.is_some();
+        if !whole && self.state.frames.not_kept() == 0 {
+            return;
+        }
+        let coming: Vec<usize> =
+            (position..).take(MOST_AHEAD).map(|position| self.view_at(stage, position)).collect();
+        match self.state.whole.as_ref().filter(|_| whole) {
+            Some(images) => images.expect(coming),
+            None => self.state.frames.expect(coming),
         }
     }
 
@@ -65,24 +70,31 @@ impl Trainer {
     pub(super) fn plan_step(&mut self, stage: Stage, iteration: u32) -> Result<StepPlan, TrainError> {
         let batch = self.state.config.stages.batch;
         let at = self.moment(stage, iteration, self.state.progress.total_steps + 1);
-        let [halves, holds_out, renormalises] =
-            [Due::HalveImages, Due::HoldOut, Due::Renormalise].map(|due| at.has(due));
+        let [halves, sees_whole, holds_out, renormalises] =
+            [Due::HalveImages, Due::WholeImages, Due::HoldOut, Due::Renormalise].map(|due| at.has(due));
+        let expects_whole = self.moment(stage, iteration.saturating_add(1), 0).has(Due::WholeImages);
         let holds_out = holds_out || self.effects.iter().any(|effect| effect.holds_out(&at));
         let counts_statistics = at.is_of_colors() && self.density.counts_statistics(&at);
         let mut views = Vec::with_capacity(batch as usize);
         for k in 0..batch {
             let view = self.view_at(stage, u64::from(iteration - 1) * u64::from(batch) + u64::from(k));
-            let mut frame = self.state.frames.get(&self.state.dataset, view)?;
             let index = self.state.frames.index(view);
             let leaves_judged = holds_out && is_judged(&self.state.frames, index);
-            let mut camera = self.state.dataset.frames[index].camera;
             // Pixels that are left out are single ones.
+            let whole = self.state.whole.as_ref().filter(|_| sees_whole && !leaves_judged);
+            let (mut frame, mut camera) = match whole {
+                Some(whole) => whole.view(view)?,
+                None => (
+                    self.state.frames.get(&self.state.dataset, view)?,
+                    self.state.dataset.frames[index].camera,
+                ),
+            };
             if halves && !leaves_judged && may_halve(camera.width, camera.height) {
                 (frame, camera) = (Arc::new(half_size::of_frame(&frame)), half_size::of_camera(&camera));
             }
             views.push(StepView { index, frame, camera, leaves_judged });
         }
-        self.expect_views(stage, u64::from(iteration) * u64::from(batch));
+        self.expect_views(stage, u64::from(iteration) * u64::from(batch), expects_whole);
         let in_instance_stage = stage == Stage::Instance;
         let with_instances = in_instance_stage && self.instance_pass == InstancePass::On;
         let of_head = self.state.value_head().filter(|_| in_instance_stage);

@@ -19,7 +19,7 @@ fn members(object: Value) -> Map<String, Value> {
 impl Trainer {
     /// The record: how to draw the field, settings, capture, steps, times, memory, versions.
     pub(super) fn provenance(&self) -> Record {
-        let (dataset, config, progress) = (&self.state.dataset, &self.state.config, &self.progress());
+        let (dataset, config, progress) = (self.state.capture(), &self.state.config, &self.progress());
         let masks = dataset.frames.iter().find_map(|frame| frame.mask.as_ref()).and_then(|mask| {
             let folder = mask.strip_prefix(&dataset.root).ok().unwrap_or(mask).components().next()?;
             folder.as_os_str().to_str().map(str::to_owned)

@@ -221,7 +221,7 @@ impl Trainer {
             version: VERSION,
             config: self.state.config.clone(),
             progress: self.progress(),
-            capture: Capture::of(&self.state.dataset, &self.inputs),
+            capture: Capture::of(self.state.capture(), &self.inputs),
             head: self.state.head.name().to_owned(),
             objects,
             travelling: self.state.guidance.travelling.clone(),

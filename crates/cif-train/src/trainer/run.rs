@@ -20,6 +20,7 @@ use crate::progress::{AfterStep, Progress};
 use crate::schedule::Due;
 use crate::stage::Stage;
 use crate::step::StepLoss;
+use crate::times::StepTimes;
 
 /// Observer of a run.
 type Observer<'a> = dyn FnMut(&TrainEvent, &TrainerView<'_>) -> Control + 'a;
@@ -42,6 +43,16 @@ impl Requests {
             Control::Stop => self.stop = true,
         }
     }
+}
+
+/// Steps since the last report.
+struct Lap {
+    /// Seconds of the stage when it was made.
+    since_s: f64,
+    /// Steps since.
+    steps: u32,
+    /// Times of all steps when it was made.
+    times: StepTimes,
 }
 
 impl Trainer {
@@ -251,7 +262,8 @@ impl Trainer {
     ) -> Result<Outcome, TrainError> {
         let mut events = Vec::new();
         let (phases, phase) = (self.state.phases.clone(), Phase::from(stage));
-        let (mut lap, mut lap_steps) = (phases.spent(phase).wall_s, 0);
+        let lap_from = |times: StepTimes| Lap { since_s: phases.spent(phase).wall_s, steps: 0, times };
+        let mut lap = lap_from(self.state.times);
         self.pace_stage(stage);
         // A budget or a target may change how many there are.
         while self.state.progress.after_step.is_some()
@@ -265,7 +277,7 @@ impl Trainer {
                 None => self.step(&mut events).map(Some),
                 Some(_) => self.finish_step(stage, &mut events).map(|()| None),
             };
-            lap_steps += u32::from(resumed.is_none());
+            lap.steps += u32::from(resumed.is_none());
             events.append(&mut self.messages);
             for event in events.drain(..) {
                 requests.add(self.emit(observer, &event));
@@ -276,12 +288,10 @@ impl Trainer {
             if let Some(loss) = loss
                 && self.done().has(Due::Report)
             {
-                let spent = phases.spent(phase).wall_s;
-                let rate = f64::from(lap_steps) / (spent - lap).max(1e-9);
                 phases.advance_to(u64::from(iteration));
-                let event = self.step_event(stage, iterations, &loss, rate);
+                let event = self.step_event(stage, iterations, &loss, &lap);
                 requests.add(self.emit(observer, &event));
-                (lap, lap_steps) = (spent, 0);
+                lap = lap_from(self.state.times);
             }
             if let Some(share) =
                 loss.and_then(|loss| loss.unsupported).filter(|share| *share > MANY_UNSUPPORTED)
@@ -350,7 +360,9 @@ impl Trainer {
         Ok(())
     }
 
-    fn step_event(&self, stage: Stage, iterations: u32, loss: &StepLoss, rate: f64) -> TrainEvent {
+    fn step_event(&self, stage: Stage, iterations: u32, loss: &StepLoss, lap: &Lap) -> TrainEvent {
+        let spent_s = self.state.phases.spent(Phase::from(stage)).wall_s - lap.since_s;
+        let rate = f64::from(lap.steps) / spent_s.max(1e-9);
         TrainEvent::Step {
             stage,
             iteration: self.state.progress.iteration,
@@ -362,7 +374,7 @@ impl Trainer {
             gaussians: self.state.field.gaussians.len(),
             psnr: self.state.progress.psnr.unwrap_or(0.0),
             iterations_per_second: rate,
-            eta_s: self.eta_s(stage, rate),
+            eta_s: self.eta_s(stage, rate, &lap.times),
         }
     }
 

@@ -45,7 +45,7 @@ impl GpuEngine {
             ..*views.settings
         };
         for index in views.frames {
-            let frame = &state.dataset.frames[*index];
+            let frame = &views.dataset(state).frames[*index];
             let input = ViewInput { camera: &frame.camera, settings: &settings, labels: None };
             let mut commands = Commands::new(gpu, None);
             let posed = match &stand_in {
