@@ -103,7 +103,7 @@ impl Trainer {
     }
 
     /// Pixels of the images of a step, relative to those that are worked on.
-    fn pixels_of_step(&self, stage: Stage, step: u32) -> f64 {
+    pub(super) fn pixels_of_step(&self, stage: Stage, step: u32) -> f64 {
         let at = self.moment(stage, step, 0);
         let reduction = f64::from(self.state.config.stages.reduction.max(1));
         if at.has(Due::WholeImages) {

@@ -1,5 +1,6 @@
 //! Sequence of the stages of a run, and the points at which it may be stopped.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 
 use cif_field::tracks::Tracks;
@@ -19,6 +20,7 @@ use crate::phase::Phase;
 use crate::progress::{AfterStep, Progress};
 use crate::schedule::Due;
 use crate::stage::Stage;
+use crate::state::State;
 use crate::step::StepLoss;
 use crate::times::StepTimes;
 
@@ -45,14 +47,26 @@ impl Requests {
     }
 }
 
-/// Steps since the last report.
-struct Lap {
-    /// Seconds of the stage when it was made.
-    since_s: f64,
-    /// Steps since.
+/// Reports that the time left is estimated from: single ones hold a measurement or a change of the set, or do not.
+const REPORTS: usize = 6;
+
+/// A report of a stage.
+struct Mark {
+    /// Seconds of the stage.
+    at_s: f64,
+    /// Steps of the stage since it was begun or resumed.
     steps: u32,
-    /// Times of all steps when it was made.
+    /// Times of all steps.
     times: StepTimes,
+    /// Pixels of its steps, relative to those that are worked on.
+    pixels: f64,
+}
+
+impl Mark {
+    /// Steps per second since an earlier one.
+    fn rate_since(&self, earlier: &Self) -> f64 {
+        f64::from(self.steps - earlier.steps) / (self.at_s - earlier.at_s).max(1e-9)
+    }
 }
 
 impl Trainer {
@@ -261,9 +275,9 @@ impl Trainer {
         requests: &mut Requests,
     ) -> Result<Outcome, TrainError> {
         let mut events = Vec::new();
-        let (phases, phase) = (self.state.phases.clone(), Phase::from(stage));
-        let lap_from = |times: StepTimes| Lap { since_s: phases.spent(phase).wall_s, steps: 0, times };
-        let mut lap = lap_from(self.state.times);
+        let phases = self.state.phases.clone();
+        let mut steps = 0;
+        let mut marks = VecDeque::from([self.mark(stage, steps)]);
         self.pace_stage(stage);
         // A budget or a target may change how many there are.
         while self.state.progress.after_step.is_some()
@@ -277,7 +291,7 @@ impl Trainer {
                 None => self.step(&mut events).map(Some),
                 Some(_) => self.finish_step(stage, &mut events).map(|()| None),
             };
-            lap.steps += u32::from(resumed.is_none());
+            steps += u32::from(resumed.is_none());
             events.append(&mut self.messages);
             for event in events.drain(..) {
                 requests.add(self.emit(observer, &event));
@@ -289,9 +303,14 @@ impl Trainer {
                 && self.done().has(Due::Report)
             {
                 phases.advance_to(u64::from(iteration));
-                let event = self.step_event(stage, iterations, &loss, &lap);
+                marks.push_back(self.mark(stage, steps));
+                // Steps of another size cost something else.
+                let pixels = marks[marks.len() - 1].pixels;
+                while marks.len() > 2 && (marks.len() > REPORTS || marks[0].pixels != pixels) {
+                    marks.pop_front();
+                }
+                let event = self.step_event(stage, iterations, &loss, &marks);
                 requests.add(self.emit(observer, &event));
-                lap = lap_from(self.state.times);
             }
             if let Some(share) =
                 loss.and_then(|loss| loss.unsupported).filter(|share| *share > MANY_UNSUPPORTED)
@@ -360,9 +379,22 @@ impl Trainer {
         Ok(())
     }
 
-    fn step_event(&self, stage: Stage, iterations: u32, loss: &StepLoss, lap: &Lap) -> TrainEvent {
-        let spent_s = self.state.phases.spent(Phase::from(stage)).wall_s - lap.since_s;
-        let rate = f64::from(lap.steps) / spent_s.max(1e-9);
+    /// The report that comes now, after so many steps since the stage was begun or resumed.
+    fn mark(&self, stage: Stage, steps: u32) -> Mark {
+        let State { progress, phases, times, .. } = &self.state;
+        let pixels = self.pixels_of_step(stage, progress.iteration.max(1));
+        Mark { at_s: phases.spent(Phase::from(stage)).wall_s, steps, times: *times, pixels }
+    }
+
+    /// Event of the last of some reports, of which there are two at least.
+    fn step_event(
+        &self,
+        stage: Stage,
+        iterations: u32,
+        loss: &StepLoss,
+        reports: &VecDeque<Mark>,
+    ) -> TrainEvent {
+        let [first, before, last] = [0, reports.len() - 2, reports.len() - 1].map(|report| &reports[report]);
         TrainEvent::Step {
             stage,
             iteration: self.state.progress.iteration,
@@ -373,8 +405,8 @@ impl Trainer {
             unsupported_px: loss.unsupported,
             gaussians: self.state.field.gaussians.len(),
             psnr: self.state.progress.psnr.unwrap_or(0.0),
-            iterations_per_second: rate,
-            eta_s: self.eta_s(stage, rate, &lap.times),
+            iterations_per_second: last.rate_since(before),
+            eta_s: self.eta_s(stage, last.rate_since(first), &first.times),
         }
     }
 
