@@ -82,7 +82,7 @@ impl Trainer {
             let more = self.gaussians_at(of, step) / gaussians.max(1.0);
             shares.cost(pixels / last, more) * cost(of) / cost(stage)
         };
-        // Costs change slowly but for a few steps, so that some tell of all.
+        // Costs change slowly but for a few steps, so that some stand for all.
         let left = |of: Stage| {
             let (done, all) = (done(of), all(of));
             let every = (all.saturating_sub(done)).div_ceil(SAMPLES).max(1);
