@@ -25,6 +25,8 @@ pub const LEAST_SHARE: f64 = 0.1;
 pub const LEAST_VIEWS: usize = 5;
 /// Distance behind the rendered surface from which on a point is hidden, as a share of the depth of that surface.
 pub const TOLERANCE: f64 = 0.05;
+/// Pixels of a training view at most; larger ones are reduced, as what hides what takes no more.
+pub const MOST_PIXELS: u32 = 1 << 18;
 /// Coverage below which a pixel shows no surface.
 const COVERED: f32 = 0.5;
 
@@ -45,8 +47,9 @@ impl TrainingViews {
         let views = (0..count).map(|k| {
             let frame = &dataset.frames[train[k * train.len() / count]];
             let channels = Channels { depth: true, instances: false };
-            let rendered = renderer.render(field, &frame.camera, frame.time, settings, channels);
-            (frame.camera, surface(&rendered, f32::INFINITY))
+            let camera = asked(&frame.camera);
+            let rendered = renderer.render(field, &camera, frame.time, settings, channels);
+            (camera, surface(&rendered, f32::INFINITY))
         });
         Self::new(views.collect())
     }
@@ -75,9 +78,8 @@ impl TrainingViews {
             let pixel = DVec2::new((k as u32 % width) as f64 + 0.5, (k as u32 / width) as f64 + 0.5);
             let point = centre + camera.ray(pixel) * f64::from(*z);
             let by = self.views.iter().filter(|(view, surface)| {
-                let (Some([column, row]), Some((_, z))) = (view.pixel_of(point), view.project(point)) else {
-                    return false;
-                };
+                let Some([column, row]) = view.pixel_of(point) else { return false };
+                let z = view.camera_from_world.apply(point).z;
                 let before = surface.pixels[(row * surface.width + column) as usize];
                 z <= f64::from(before) * (1.0 + TOLERANCE)
             });
@@ -85,6 +87,13 @@ impl TrainingViews {
         });
         PixelGrid::from_pixels(depth.width, depth.height, shown.collect())
     }
+}
+
+/// A training view at the size at which it is asked.
+fn asked(camera: &PinholeCamera) -> PinholeCamera {
+    let pixels = f64::from(camera.width) * f64::from(camera.height);
+    let by = (pixels / f64::from(MOST_PIXELS)).sqrt().ceil().max(1.0) as u32;
+    camera.resized(camera.width.div_ceil(by), camera.height.div_ceil(by))
 }
 
 /// Depth of a render, and `nothing` where the field hardly covers a pixel.
@@ -129,6 +138,28 @@ mod tests {
         let views = TrainingViews::new(vec![(camera(-0.25), depth([1.0; 4])); 5]);
         let shown = views.show_surface(&camera(0.0), &depth([1.0; 4]));
         assert_eq!(shown.pixels, [true, true, true, false]);
+    }
+
+    #[test]
+    fn large_training_views_are_asked_at_a_smaller_size() {
+        let size = |width, height| {
+            let asked = asked(&PinholeCamera { width, height, ..camera(0.0) });
+            [asked.width, asked.height]
+        };
+        assert_eq!([size(512, 512), size(640, 360)], [[512, 512], [640, 360]], "as they are");
+        assert_eq!(
+            [size(800, 600), size(1920, 1080), size(4000, 3000)],
+            [[400, 300], [640, 360], [572, 429]]
+        );
+        let large = PinholeCamera {
+            width: 1920,
+            height: 1080,
+            principal_px: DVec2::new(950.0, 530.0),
+            ..camera(0.2)
+        };
+        let [whole, small] =
+            [large, asked(&large)].map(|camera| camera.project(DVec3::new(0.3, -0.1, 2.0)).unwrap().0);
+        assert!((whole / 3.0 - small).length() < 1e-9, "{whole} {small}");
     }
 
     #[test]
