@@ -6,7 +6,7 @@ use std::sync::Arc;
 use cif_dataset::{Dataset, Split};
 use cif_geometry::PinholeCamera;
 
-use crate::budget::StepCosts;
+use crate::budget::{Part, StepCosts};
 use crate::config::{MAX_REDUCTION, StagesConfig, TrainConfig};
 use crate::error::TrainError;
 use crate::frames::{FrameStore, TrainFrame};
@@ -62,7 +62,10 @@ pub(crate) fn step_costs([width, height]: [u32; 2], reduction: u32, stages: &Sta
     let first = if may_halve(width, height) { f64::from(stages.half_size).min(1.0 - last) } else { 0.0 };
     // Of a step with so many times the pixels.
     let cost = |pixels: f64| 1.0 + PIXEL_SHARE * (pixels - 1.0);
-    StepCosts { first: (first, cost(0.25)), last: (last, cost(f64::from(reduction.max(1)).powi(2))) }
+    StepCosts {
+        first: Part { share: first, cost: cost(0.25) },
+        last: Part { share: last, cost: cost(f64::from(reduction.max(1)).powi(2)) },
+    }
 }
 
 /// A capture whose images are loaded reduced.
@@ -159,11 +162,11 @@ mod tests {
         let stages = StagesConfig { half_size: 0.4, whole_size: 0.2, ..StagesConfig::default() };
         let of = |size, reduction| step_costs(size, reduction, &stages);
         let rounded = |share: f64| (share * 1e4).round() / 1e4;
-        let shares = |costs: StepCosts| [costs.first.0, costs.last.0].map(rounded);
+        let shares = |costs: StepCosts| [costs.first.share, costs.last.share].map(rounded);
         assert_eq!(shares(of([256, 192], 1)), [0.4, 0.0]);
         assert_eq!(shares(of([256, 120], 2)), [0.0, 0.2], "too small to be halved");
         let two = of([256, 192], 2);
         assert_eq!(shares(two), [0.4, 0.2]);
-        assert!(two.first.1 > 0.25 && two.first.1 < 1.0 && two.last.1 > 1.0 && two.last.1 < 4.0);
+        assert!(two.first.cost > 0.25 && two.first.cost < 1.0 && two.last.cost > 1.0 && two.last.cost < 4.0);
     }
 }

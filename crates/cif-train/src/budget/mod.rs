@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::clock::Seconds;
 
-pub use pacer::{COARSE, INSTANCE, OtherWork, Pacer, StageShare, StepCosts};
+pub use pacer::{COARSE, INSTANCE, OtherWork, Pacer, Part, StageShare, StepCosts};
 pub(crate) use pacer::{FITS, IDENTITY_STEPS_PER_FRAME, REHEARSAL, TRIALS, weights};
 
 /// Which time a budget counts.

@@ -10,35 +10,42 @@ pub const COARSE: f64 = 0.35;
 /// The same of an instance step: the instance pass on top.
 pub const INSTANCE: f64 = 1.25;
 
+/// Some steps of a stage.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Part {
+    /// Share of all steps.
+    pub share: f64,
+    /// Cost of one, relative to those in the middle of the stage.
+    pub cost: f64,
+}
+
 /// Costs of the steps of a stage relative to those in its middle, which cost 1: the first ones may cost less, and the last
 /// ones more, as they see images of other sizes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StepCosts {
-    /// Share of the first steps, and the cost of one.
-    pub first: (f64, f64),
-    /// Share of the last steps, and the cost of one.
-    pub last: (f64, f64),
+    /// The first steps.
+    pub first: Part,
+    /// The last steps.
+    pub last: Part,
 }
 
 impl StepCosts {
     /// Mean cost of all steps of the stage.
     #[must_use]
     pub fn mean(&self) -> f64 {
-        1.0 - self.first.0 * (1.0 - self.first.1) - self.last.0 * (1.0 - self.last.1)
+        1.0 - self.first.share * (1.0 - self.first.cost) - self.last.share * (1.0 - self.last.cost)
     }
 
     /// Cost of the first `done` of so many steps.
-    #[must_use]
-    pub fn cost_up_to(&self, done: u32, steps: u32) -> f64 {
+    fn cost_up_to(&self, done: u32, steps: u32) -> f64 {
         let (done, steps) = (f64::from(done), f64::from(steps));
-        let last = (done - (steps - (self.last.0 * steps).floor())).max(0.0);
-        let first = (self.first.0 * steps).floor().min(done - last);
-        done - first * (1.0 - self.first.1) - last * (1.0 - self.last.1)
+        let last = (done - (steps - (self.last.share * steps).floor())).max(0.0);
+        let first = (self.first.share * steps).floor().min(done - last);
+        done - first * (1.0 - self.first.cost) - last * (1.0 - self.last.cost)
     }
 
     /// Cost of a step, from 1, of so many.
-    #[must_use]
-    pub fn cost_of(&self, step: u32, steps: u32) -> f64 {
+    fn cost_of(&self, step: u32, steps: u32) -> f64 {
         self.cost_up_to(step, steps) - self.cost_up_to(step.saturating_sub(1), steps)
     }
 
@@ -48,12 +55,13 @@ impl StepCosts {
         let done = f64::from(done);
         // Each part of the stage keeps its share of the steps, unless it is over.
         let all = (spent + more) / self.mean();
-        if done < self.first.0 * all {
+        if done < self.first.share * all {
             return all;
         }
-        let first = (self.first.0 * f64::from(steps)).floor().min(done);
-        let all = (spent + more + first * (1.0 - self.first.1)) / (1.0 - self.last.0 * (1.0 - self.last.1));
-        if done < (1.0 - self.last.0) * all { all } else { done + more / self.last.1 }
+        let first = (self.first.share * f64::from(steps)).floor().min(done);
+        let all = (spent + more + first * (1.0 - self.first.cost))
+            / (1.0 - self.last.share * (1.0 - self.last.cost));
+        if done < (1.0 - self.last.share) * all { all } else { done + more / self.last.cost }
     }
 }
 
@@ -279,6 +287,7 @@ mod tests {
         let with_last =
             [((0.4, 0.4), (0.2, 3.0)), (none, (0.3, 2.0)), ((0.4, 0.5), (0.5, 4.0)), (none, (1.0, 2.0))];
         for (first, last) in cases.into_iter().chain(with_last) {
+            let [first, last] = [first, last].map(|(share, cost)| Part { share, cost });
             let costs = StepCosts { first, last };
             let mut pacer = Pacer::new(budget);
             let stage = StageShare { stage: Stage::Fine, weight: 1.0, costs };
@@ -287,14 +296,14 @@ mod tests {
             let (mut iteration, mut steps, mut of_kinds, mut least) = (0, 700, [0, 0], u32::MAX);
             while iteration < steps {
                 iteration += 1;
-                let is_first = f64::from(iteration) <= first.0 * f64::from(steps);
-                let is_last = iteration > steps - (last.0 * f64::from(steps)) as u32;
+                let is_first = f64::from(iteration) <= first.share * f64::from(steps);
+                let is_last = iteration > steps - (last.share * f64::from(steps)) as u32;
                 of_kinds[0] += u32::from(is_first);
                 of_kinds[1] += u32::from(is_last);
                 now.wall_s += 0.1
                     * match (is_first, is_last) {
-                        (true, _) => first.1,
-                        (_, true) => last.1,
+                        (true, _) => first.cost,
+                        (_, true) => last.cost,
                         _ => 1.0,
                     };
                 steps = pacer.after_step(iteration, steps, now).unwrap_or(steps);
@@ -304,7 +313,7 @@ mod tests {
             }
             let expected = 99.5 / (0.1 * costs.mean());
             assert!((f64::from(steps) / expected - 1.0).abs() < 0.01, "{steps} of {expected}: {costs:?}");
-            for (count, share) in of_kinds.into_iter().zip([first.0, last.0]) {
+            for (count, share) in of_kinds.into_iter().zip([first.share, last.share]) {
                 let found = f64::from(count) / f64::from(steps);
                 assert!((found - share).abs() < 0.02, "{count} of {steps}: {costs:?}");
             }

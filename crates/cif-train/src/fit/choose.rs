@@ -1,7 +1,7 @@
 //! Which settings fit a budget: steps, Gaussians and, where nothing else helps, resolution.
 
 use super::Calibration;
-use crate::budget::{COARSE, FITS, INSTANCE, StepCosts};
+use crate::budget::{COARSE, FITS, INSTANCE};
 use crate::config::TrainConfig;
 use crate::working_size;
 
@@ -68,8 +68,8 @@ fn expected_s(config: &TrainConfig, calibration: &Calibration, work: Workload, r
     let mean = (MEAN_GAUSSIANS * most).max(calibration.gaussians.min(most as usize) as f64);
     let size = calibration.image_size.map(|side| side / reduction);
     let working = working_size::of_size(size, config);
-    let StepCosts { first: (halved, _), last: (whole, _) } =
-        working_size::step_costs(size.map(|side| side / working), working, &config.stages);
+    let costs = working_size::step_costs(size.map(|side| side / working), working, &config.stages);
+    let (halved, whole) = (costs.first.share, costs.last.share);
     let few = calibration.step_s(calibration.gaussians.min(most as usize) as f64, reduction * working);
     let fine = f64::from(config.fine_iterations())
         * (halved * calibration.step_s(mean, 2 * reduction * working)

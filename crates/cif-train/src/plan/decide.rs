@@ -176,7 +176,7 @@ impl Plan<'_> {
                 ),
             }),
             evidence: format!("{width} x {height} pixels, {per_gaussian:.1} for each Gaussian of a full set"),
-            cost: "steps take about as long as pixels are many where these are large".to_owned(),
+            cost: "the time of a step grows with its pixels, most where images are large".to_owned(),
             flag: "--set stages.reduction=N".to_owned(),
         }
     }

@@ -234,10 +234,10 @@ impl Trainer {
         let inputs = resume::inputs_of(&capture);
         // Gaussians of another scene were trained on its images.
         field.record.images.get_or_insert_with(|| serde_json::json!(TrainedImages::of(&capture, &inputs)));
-        let is_reduced = reduction > 1;
-        let (dataset, capture) = match is_reduced {
-            true => (working_size::reduced(capture.clone(), reduction), Some(capture)),
-            false => (capture, None),
+        let (dataset, capture) = if reduction > 1 {
+            (working_size::reduced(capture.clone(), reduction), Some(capture))
+        } else {
+            (capture, None)
         };
         let budget = u64::from(config.frame_memory_mib) << 20;
         let maps = match config.head.name {

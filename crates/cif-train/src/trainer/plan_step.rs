@@ -55,14 +55,15 @@ impl Trainer {
     /// for all.
     fn expect_views(&mut self, stage: Stage, position: u64, whole: bool) {
         let whole = whole && self.state.whole.is_some();
-        if !whole && self.state.frames.not_kept() == 0 {
-            return;
+        let mut coming = Vec::new();
+        if whole || self.state.frames.not_kept() > 0 {
+            coming.extend((position..).take(MOST_AHEAD).map(|position| self.view_at(stage, position)));
         }
-        let coming: Vec<usize> =
-            (position..).take(MOST_AHEAD).map(|position| self.view_at(stage, position)).collect();
-        match self.state.whole.as_ref().filter(|_| whole) {
-            Some(images) => images.expect(coming),
-            None => self.state.frames.expect(coming),
+        // Frames of the other size that were begun are given up, with their memory.
+        let (of_whole, of_reduced) = if whole { (coming, Vec::new()) } else { (Vec::new(), coming) };
+        self.state.frames.expect(of_reduced);
+        if let Some(images) = &self.state.whole {
+            images.expect(of_whole);
         }
     }
 
