@@ -24,7 +24,6 @@ mod bands;
 mod bin;
 mod blend;
 mod blend_backward;
-mod channels;
 mod contributors;
 mod counts;
 mod deform;
@@ -48,7 +47,6 @@ mod renderer;
 mod rotation;
 mod tile;
 mod timing;
-mod vector;
 
 pub use contributors::{ContributorMass, ContributorRule};
 pub use counts::IdentityCounts;

@@ -25,7 +25,7 @@ pub const STAGES: &[StageRow] = &[
     StageRow {
         name: "deform",
         modules: deform::MODULES,
-        cpu: &["deform.rs"],
+        cpu: &["deform/mod.rs", "deform/lookup.rs", "deform/network.rs"],
         reference: Some("deform.rs"),
         gradients: Some(("gradients.rs", "deformed_with_all_heads")),
     },

@@ -121,8 +121,8 @@ impl Renderer {
         let deformation =
             field.deformation.as_ref().filter(|_| settings.deform).map(|d| DeformationAtTime::new(d, time));
         let mut v_posed = Gaussians::default();
-        timed(&mut times.project_backward, || {
-            self.project_backward(field, &view, pairs, gradients, &mut v_posed);
+        let with_gradient = timed(&mut times.project_backward, || {
+            self.project_backward(field, &view, pairs, gradients, &mut v_posed)
         });
         if let Some(tracks) = &field.tracks {
             timed(&mut times.project_backward, || {
@@ -144,19 +144,14 @@ impl Renderer {
                 {
                     *total += v;
                 }
-                let tensors = v_posed.tensors().map(|(parameter, values)| (parameter.width(), values));
-                let has_gradient = |row: usize| {
-                    tensors.iter().any(|(width, values)| {
-                        values
-                            .get(row * width..(row + 1) * width)
-                            .is_some_and(|v| v.iter().any(|v| *v != 0.0))
-                    })
-                };
                 let is_grouped =
                     |row: usize| field.tracks.as_ref().is_some_and(|tracks| tracks.group(row).is_some());
+                let is_displaced =
+                    |row: u32| v_displacements.get(row as usize).is_some_and(|v| *v != [0.0; 3]);
+                let mut with_gradient = with_gradient.into_iter().peekable();
                 let active: Vec<u32> = (0..n as u32)
-                    .filter(|&row| deformation.moves(row as usize) && has_gradient(row as usize))
-                    .filter(|&row| !is_grouped(row as usize))
+                    .filter(|row| with_gradient.next_if_eq(row).is_some() || is_displaced(*row))
+                    .filter(|row| deformation.moves(*row as usize) && !is_grouped(*row as usize))
                     .collect();
                 self.statistics.deformed_backward = active.len();
                 deformation.backward(
@@ -164,6 +159,7 @@ impl Renderer {
                     &field.gaussians,
                     &active,
                     &v_posed,
+                    &mut self.deform_scratch,
                     &mut gradients.planes,
                     &mut gradients.mlp,
                     &mut gradients.gaussians.means,
@@ -242,7 +238,8 @@ impl Renderer {
         (pairs, LabelMass { offsets, values })
     }
 
-    /// Sums each splat's pairs and carries them to the raw parameters.
+    /// Sums each splat's pairs and carries them to the raw parameters. Returns the rows with a gradient by what a
+    /// deformation moves, ascending.
     fn project_backward(
         &self,
         field: &Field,
@@ -250,7 +247,7 @@ impl Renderer {
         pairs: &[SplatGradient],
         gradients: &mut Gradients,
         v_posed: &mut Gaussians,
-    ) {
+    ) -> Vec<u32> {
         let tape = &self.tape;
         let n = field.gaussians.len();
         let rank_of = self.ranks(n);
@@ -265,12 +262,14 @@ impl Renderer {
         let half = [view.width as f32 / 2.0, view.height as f32 / 2.0];
         let level = self.level;
         let rows = gradients.gaussians.rows_mut().chunks(CHUNK, n).into_par_iter();
-        rows.zip(v_posed.rows_mut().chunks(CHUNK, n))
+        let posed_rows: Vec<Vec<u32>> = rows
+            .zip(v_posed.rows_mut().chunks(CHUNK, n))
             .zip(gradients.screen.par_chunks_mut(CHUNK))
             .zip(gradients.radii.par_chunks_mut(CHUNK))
             .enumerate()
-            .for_each(|(chunk, (((total, of_view), screen), radii))| {
+            .map(|(chunk, (((total, of_view), screen), radii))| {
                 let mut found = Vec::with_capacity(radii.len());
+                let mut posed_rows = Vec::new();
                 for row in 0..radii.len() {
                     let rank = rank_of[chunk * CHUNK + row];
                     if rank == NOT_VISIBLE {
@@ -323,9 +322,21 @@ impl Renderer {
                         of_view.log_scales[row] = log_scale;
                         of_view.quaternions[row] = quaternion;
                         of_view.opacity_logits[row] = opacity_logit;
+                        // Losses of identities may reach occupancies alone.
+                        if v.color != [0.0; 3]
+                            || opacity_logit != 0.0
+                            || mean != [0.0; 3]
+                            || log_scale != [0.0; 3]
+                            || quaternion != [0.0; 4]
+                        {
+                            posed_rows.push(splat.gaussian);
+                        }
                     }
                 }
-            });
+                posed_rows
+            })
+            .collect();
+        posed_rows.concat()
     }
 
     /// `v_mu_i^k = -(rho_i^k - p_i^k R_i)` (methods reference 4.2).

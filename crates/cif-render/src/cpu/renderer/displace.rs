@@ -42,6 +42,7 @@ impl Renderer {
             &field.gaussians,
             &active,
             &v_posed,
+            &mut self.deform_scratch,
             &mut gradients.planes,
             &mut gradients.mlp,
             &mut gradients.gaussians.means,

@@ -31,6 +31,7 @@ pub use self::blend::BlendWeightGradients;
 pub use self::inspect::NotFinite;
 use self::pose::pose;
 use super::bin::{TileLists, TileRegion, sort_by_depth};
+use super::deform::DeformScratch;
 use super::labels::{IdentityRows, TileLabels};
 use super::level::SimdLevel;
 use super::posed::PosedView;
@@ -105,6 +106,7 @@ pub struct Renderer {
     statistics: ViewStatistics,
     tape: Tape,
     inspection: inspect::Inspection,
+    deform_scratch: DeformScratch,
     band_memory: u64,
 }
 
@@ -130,6 +132,7 @@ impl Renderer {
             statistics: ViewStatistics::default(),
             tape: Tape::default(),
             inspection: inspect::Inspection::default(),
+            deform_scratch: DeformScratch::default(),
             band_memory: banded::BAND_MEMORY,
         }
     }

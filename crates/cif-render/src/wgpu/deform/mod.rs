@@ -1,4 +1,4 @@
-//! The deformation on the device: the stages of `cpu/deform.rs` as kernels.
+//! The deformation on the device: the stages of `cpu/deform` as kernels.
 //!
 //! | file | stage |
 //! |---|---|
