@@ -251,6 +251,18 @@ impl Renderer {
         let tape = &self.tape;
         let n = field.gaussians.len();
         let rank_of = self.ranks(n);
+        // In depth order, as pairs lie in the lists of tiles: by rows, each would be fetched from memory on its own.
+        let sums: Vec<SplatGradient> = (0..tape.splats.len())
+            .into_par_iter()
+            .with_min_len(CHUNK)
+            .map(|rank| {
+                let mut sum = SplatGradient::default();
+                for &pair in tape.lists.pairs_of(rank) {
+                    sum.add(&pairs[pair as usize]);
+                }
+                sum
+            })
+            .collect();
         let posed = PosedView::new(&field.gaussians, &tape.posed);
         let moves_sh = !tape.posed.sh_coefficients.is_empty();
         let is_moved = |parameter: &Parameter| match *parameter {
@@ -277,10 +289,7 @@ impl Renderer {
                     }
                     let splat = &tape.splats[rank as usize];
                     radii[row] = splat.radius.max(radii[row]);
-                    let mut v = SplatGradient::default();
-                    for &pair in tape.lists.pairs_of(rank as usize) {
-                        v.add(&pairs[pair as usize]);
-                    }
+                    let v = sums[rank as usize];
                     if v != SplatGradient::default() {
                         found.push((row, splat, v));
                     }
