@@ -2,6 +2,7 @@
 //! motion, 2.1.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 use cif_field::checkpoint::StateTensor;
 use cif_field::{Gaussians, Tracks};
@@ -52,6 +53,31 @@ impl PoseMoments {
         self.second.resize(poses, [0.0; WIDTH]);
         self.steps.resize(poses, 0);
         self.shares.extend(shares);
+    }
+
+    /// Keeps those at `trained` of poses at `places`, with so many that are not trained before and behind them.
+    pub(crate) fn replace(
+        &mut self,
+        places: Range<usize>,
+        trained: Range<usize>,
+        [before, behind]: [usize; 2],
+    ) {
+        fn put<T: Copy>(
+            values: &mut Vec<T>,
+            places: &Range<usize>,
+            kept: &Range<usize>,
+            around: [usize; 2],
+            new: T,
+        ) {
+            let kept = values[kept.clone()].to_vec();
+            let [before, behind] = around.map(|count| vec![new; count]);
+            values.splice(places.clone(), [before, kept, behind].concat());
+        }
+        let around = [before, behind];
+        put(&mut self.first, &places, &trained, around, [0.0; WIDTH]);
+        put(&mut self.second, &places, &trained, around, [0.0; WIDTH]);
+        put(&mut self.steps, &places, &trained, around, 0);
+        put(&mut self.shares, &places, &trained, around, 0.0);
     }
 
     /// Moves the poses that views were drawn of, each at its share of `rate`: translations at that of the `sizes` of the

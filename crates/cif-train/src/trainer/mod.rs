@@ -14,6 +14,7 @@
 //! | `identity` | how identity rows come about |
 //! | `shares` | how much of a Gaussian is of any instance |
 //! | `contradicted` | which Gaussians masks show to be of no instance |
+//! | `continued` | where bodies are before the first and after the last training frame |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
 //! | `resume` | what is saved, and how a run resumes |
 //! | `evaluate` | what a run has reached, on a few frames |
@@ -28,6 +29,7 @@
 //! threads.
 
 mod backend;
+mod continued;
 mod contradicted;
 mod contributions;
 mod eta;

@@ -172,6 +172,9 @@ impl Trainer {
         self.send_messages(observer, requests);
         let next = self.stages.after(&self.state.config, stage);
         self.end_stage(stage, next, observer, requests)?;
+        if next == Stage::Done {
+            self.continue_poses();
+        }
         self.enter(next)?;
         self.send_messages(observer, requests);
         if next == Stage::Done {

@@ -90,13 +90,15 @@ impl Renderer {
             assert_eq!((v_alpha.width, v_alpha.height), (view.width, view.height), "cotangent size");
         }
         let mut times = self.times;
-        let (pairs, label_mass) = timed(&mut times.rasterize_backward, || {
-            self.rasterize_backward(field, (v_color, v_alpha), instance_weight, &settings)
+        let mut pairs = std::mem::take(&mut self.pair_gradients);
+        let label_mass = timed(&mut times.rasterize_backward, || {
+            self.rasterize_backward(field, (v_color, v_alpha), instance_weight, &settings, &mut pairs)
         });
         self.inspect_pairs(&pairs, &label_mass.values);
         timed(&mut times.project_backward, || self.calibration_backward(field, &label_mass, gradients));
         self.times = times;
         self.splats_backward(field, &pairs, v_displacements, gradients);
+        self.pair_gradients = pairs;
     }
 
     /// Carries gradients of (tile, splat) pairs, and those by what the deformation adds to the centres, to the
@@ -170,14 +172,15 @@ impl Renderer {
         self.times = times;
     }
 
-    /// Per (tile, splat) gradients and label masses.
+    /// Sets the gradients of (tile, splat) pairs, and returns their label masses.
     fn rasterize_backward(
         &self,
         field: &Field,
         (v_color, v_alpha): (&PixelGrid<[f32; 3]>, Option<&PixelGrid<f32>>),
         instance_weight: f32,
         settings: &RenderSettings,
-    ) -> (Vec<SplatGradient>, LabelMass) {
+        pairs: &mut Vec<SplatGradient>,
+    ) -> LabelMass {
         let tape = &self.tape;
         let lists = &tape.lists;
         let trains_instances = instance_weight != 0.0 && tape.labelled_pixels > 0;
@@ -191,7 +194,8 @@ impl Renderer {
             let slots = instances(tile).map_or(0, |(labels, _)| labels.labels.len());
             offsets.push(offsets[tile] + slots * lists.tile(tile).len());
         }
-        let mut pairs = vec![SplatGradient::default(); lists.entries.len()];
+        pairs.clear();
+        pairs.resize(lists.entries.len(), SplatGradient::default());
         let mut values = vec![0.0_f32; offsets[lists.tiles()]];
         let mut tasks = Vec::with_capacity(lists.tiles());
         let (mut pair_rest, mut mass_rest) = (&mut pairs[..], &mut values[..]);
@@ -235,7 +239,7 @@ impl Renderer {
                     simd, &tape.splats, entries, &place, &mut cotangents, None, pairs, mass);
             });
         });
-        (pairs, LabelMass { offsets, values })
+        LabelMass { offsets, values }
     }
 
     /// Sums each splat's pairs and carries them to the raw parameters. Returns the rows with a gradient by what a

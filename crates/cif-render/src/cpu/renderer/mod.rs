@@ -36,6 +36,7 @@ use super::labels::{IdentityRows, TileLabels};
 use super::level::SimdLevel;
 use super::posed::PosedView;
 use super::project::{Splat, ViewConstants, project_rows};
+use super::project_backward::SplatGradient;
 use super::rasterize::{TileImage, rasterize_tile};
 use super::tile::{GROUPS, TilePlace};
 use super::timing::{StageTimes, timed};
@@ -107,6 +108,8 @@ pub struct Renderer {
     tape: Tape,
     inspection: inspect::Inspection,
     deform_scratch: DeformScratch,
+    /// Memory of the gradients of (tile, splat) pairs, which would be cleared by the system in every step.
+    pair_gradients: Vec<SplatGradient>,
     band_memory: u64,
 }
 
@@ -133,6 +136,7 @@ impl Renderer {
             tape: Tape::default(),
             inspection: inspect::Inspection::default(),
             deform_scratch: DeformScratch::default(),
+            pair_gradients: Vec::new(),
             band_memory: banded::BAND_MEMORY,
         }
     }

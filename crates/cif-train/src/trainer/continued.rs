@@ -1,0 +1,226 @@
+//! Poses at times of the capture that no training frame shows: before the first and after the last of them, as where
+//! every eighth frame is held out.
+
+use cif_dataset::{Dataset, Split};
+use cif_field::Tracks;
+use cif_field::tracks::TrackPose;
+use cif_render::Gradients;
+use glam::DQuat;
+
+use super::Trainer;
+use crate::poses::PoseMoments;
+
+/// Times that training frames show, and those outside that a capture has.
+struct Span {
+    first: f64,
+    last: f64,
+    /// The longest time between two training frames: so far motion is taken to go on.
+    reach: f64,
+    before: Vec<f64>,
+    after: Vec<f64>,
+}
+
+impl Span {
+    /// `None` without two times of training frames.
+    fn of(dataset: &Dataset) -> Option<Self> {
+        let training = dataset.frames.iter().filter(|frame| frame.split == Split::Train);
+        let mut times: Vec<f64> = training.map(|frame| frame.time).collect();
+        times.sort_by(f64::total_cmp);
+        let reach = times.windows(2).map(|pair| pair[1] - pair[0]).fold(0.0, f64::max);
+        let (first, last) = (*times.first()?, *times.last()?);
+        let outside = |is_outside: &dyn Fn(f64) -> bool| {
+            dataset.times.iter().copied().filter(|time| is_outside(*time)).collect()
+        };
+        (reach > 0.0).then(|| Self {
+            first,
+            last,
+            reach,
+            before: outside(&|time| time < first),
+            after: outside(&|time| time > last),
+        })
+    }
+
+    fn has(&self, pose: &TrackPose) -> bool {
+        (self.first..=self.last).contains(&pose.time)
+    }
+}
+
+/// The pose at a time before the first of ascending poses, or after the last: motion goes on at the mean speed that it has
+/// beside them over as long a time, or over all of them where they last less, and then for no longer. `None` without two
+/// poses.
+fn continued(poses: &[TrackPose], time: f64, reach: f64) -> Option<TrackPose> {
+    let ascending: Vec<&TrackPose> =
+        if time < poses.first()?.time { poses.iter().collect() } else { poses.iter().rev().collect() };
+    let nearest = ascending[0];
+    let away = |pose: &TrackPose| (pose.time - nearest.time).abs();
+    let gap = (time - nearest.time).abs().min(reach);
+    let other = ascending.iter().skip(1).find(|pose| away(pose) >= gap).or(ascending.last())?;
+    if away(other) == 0.0 {
+        return None;
+    }
+    let share = (gap / away(other)).min(1.0);
+    let turn = nearest.rotation * other.rotation.conjugate();
+    let turn = if turn.w < 0.0 { -turn } else { turn };
+    let turned = DQuat::from_scaled_axis(turn.to_scaled_axis() * share) * nearest.rotation;
+    Some(TrackPose {
+        time,
+        translation: nearest.translation + share * (nearest.translation - other.translation),
+        rotation: if turned.dot(nearest.rotation) < 0.0 { -turned } else { turned.normalize() },
+    })
+}
+
+/// Gives groups that the first or the last training frame shows poses at the times outside; those that were there are
+/// found anew. True where poses have changed.
+fn continue_tracks(tracks: &mut Tracks, moments: &mut PoseMoments, span: &Span) -> bool {
+    let mut place = 0;
+    let mut changed = false;
+    for group in &mut tracks.groups {
+        let count = group.poses.len();
+        let seen: Vec<TrackPose> = group.poses.iter().copied().filter(|pose| span.has(pose)).collect();
+        let held_before = group.poses.iter().take_while(|pose| pose.time < span.first).count();
+        let of = |times: &[f64]| -> Vec<TrackPose> {
+            times.iter().filter_map(|time| continued(&seen, *time, span.reach)).collect()
+        };
+        let is_at = |pose: Option<&TrackPose>, time: f64| pose.is_some_and(|pose| pose.time == time);
+        let before = if is_at(seen.first(), span.first) { of(&span.before) } else { Vec::new() };
+        let after = if is_at(seen.last(), span.last) { of(&span.after) } else { Vec::new() };
+        let trained = place + held_before..place + held_before + seen.len();
+        moments.replace(place..place + count, trained, [before.len(), after.len()]);
+        let poses = [before, seen, after].concat();
+        place += poses.len();
+        changed |= poses != group.poses;
+        group.poses = poses;
+    }
+    changed
+}
+
+impl Trainer {
+    /// Continues the motion of objects to the times of the capture before the first and after the last training frame.
+    pub(super) fn continue_poses(&mut self) {
+        let Some(span) = Span::of(&self.state.dataset) else { return };
+        let state = &mut self.state;
+        let Some(tracks) = &mut state.field.tracks else { return };
+        if continue_tracks(tracks, &mut state.pose_moments, &span) {
+            state.gradients = Gradients::zeros(&state.field);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use cif_field::Gaussians;
+    use cif_field::tracks::TrackGroup;
+    use glam::DVec3;
+
+    use super::super::guard_tests::support::{Scene, capture, small_config};
+    use super::*;
+    use crate::events::{Control, Outcome};
+    use crate::stage::Stage;
+
+    const SPAN: Span = Span { first: 0.2, last: 0.8, reach: 0.2, before: Vec::new(), after: Vec::new() };
+
+    fn span() -> Span {
+        Span { before: vec![0.0, 0.1], after: vec![0.9], ..SPAN }
+    }
+
+    /// A group that moves at a speed and turns around z, with keys at some times.
+    fn moving(times: &[f64]) -> TrackGroup {
+        let pose = |time: &f64| TrackPose {
+            time: *time,
+            translation: DVec3::new(2.0 * time, 0.0, 1.0),
+            rotation: DQuat::from_rotation_z(3.0 * time),
+        };
+        TrackGroup { poses: times.iter().map(pose).collect(), ..TrackGroup::still("a", DVec3::ZERO) }
+    }
+
+    #[test]
+    fn steady_motion_goes_on() {
+        let group = moving(&[0.2, 0.3, 0.5, 0.8]);
+        for time in [0.0, 0.1, 0.9] {
+            let pose = continued(&group.poses, time, SPAN.reach).unwrap();
+            assert!(pose.translation.distance(DVec3::new(2.0 * time, 0.0, 1.0)) < 1e-12, "{time}: {pose:?}");
+            assert!(
+                pose.rotation.angle_between(DQuat::from_rotation_z(3.0 * time)) < 1e-6,
+                "{time}: {pose:?}"
+            );
+        }
+        // Beyond the reach it stays; one pose says nothing of motion.
+        let far = continued(&group.poses, -1.0, 0.2).unwrap();
+        assert!((far.translation.x - 0.0).abs() < 1e-12, "{far:?}");
+        assert_eq!(continued(&group.poses[..1], 0.0, 0.2), None);
+        // No longer than the motion is known.
+        let short = continued(&group.poses[..2], 0.0, 0.2).unwrap();
+        assert!((short.translation.x - 0.2).abs() < 1e-12, "{short:?}");
+    }
+
+    #[test]
+    fn what_rests_stays_to_the_bit() {
+        let mut group = moving(&[0.2, 0.3, 0.4]);
+        for pose in &mut group.poses {
+            (pose.translation, pose.rotation) = (DVec3::splat(0.7), DQuat::IDENTITY);
+        }
+        let pose = continued(&group.poses, 0.1, 0.2).unwrap();
+        assert_eq!((pose.translation, pose.rotation), (DVec3::splat(0.7), DQuat::IDENTITY));
+    }
+
+    #[test]
+    fn moments_follow_their_poses_and_a_second_time_changes_nothing() {
+        // Of the second, the first training frame shows nothing: it is not known to have been there.
+        let groups = vec![moving(&[0.2, 0.5, 0.8]), moving(&[0.5, 0.8]), TrackGroup::still("b", DVec3::ZERO)];
+        let mut tracks = Tracks { groups, ..Tracks::default() };
+        let mut moments = PoseMoments::zeros(Some(&tracks));
+        for (k, steps) in moments.steps.iter_mut().enumerate() {
+            *steps = 10 + k as u32;
+        }
+        assert!(continue_tracks(&mut tracks, &mut moments, &span()));
+        let times =
+            |group: usize| tracks.groups[group].poses.iter().map(|pose| pose.time).collect::<Vec<_>>();
+        assert_eq!(times(0), [0.0, 0.1, 0.2, 0.5, 0.8, 0.9]);
+        assert_eq!(times(1), [0.5, 0.8, 0.9]);
+        assert!(times(2).is_empty());
+        assert_eq!(moments.steps, [0, 0, 10, 11, 12, 0, 13, 14, 0]);
+        assert_eq!(moments.shares, [0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 0.0]);
+        let (before, kept) = (tracks.clone(), moments.clone());
+        assert!(!continue_tracks(&mut tracks, &mut moments, &span()));
+        assert!(tracks == before && moments == kept);
+        // Poses that were trained on take those outside with them.
+        tracks.groups[0].poses[2].translation.y = 1.0;
+        assert!(continue_tracks(&mut tracks, &mut moments, &span()));
+        assert!(tracks.groups[0].poses[1].translation.y > 1.0 && moments == kept);
+    }
+
+    /// The time of the first frames is held out, as every eighth frame of a video is: a body in steady motion is in its
+    /// place there once a run has ended, and in one that is read back.
+    #[test]
+    fn finished_runs_know_where_bodies_are_before_their_first_training_frame() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut dataset = capture(folder.path(), Scene { times: 4, views: 2, ..Scene::default() });
+        for frame in dataset.frames.iter_mut().filter(|frame| frame.time == 0.0) {
+            frame.split = Split::Val;
+        }
+        let mut config = small_config();
+        (config.stages.coarse, config.stages.fine, config.stages.instance) = (2, 4, 2);
+        let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
+        while trainer.stage() != Stage::Fine {
+            let next = trainer.stages.after(&trainer.state.config, trainer.stage());
+            trainer.enter(next).unwrap();
+        }
+        let times = trainer.state.dataset.times.clone();
+        let rows = Gaussians::from_points(&[[0.0; 3], [0.1; 3]], &[[0.5; 3]; 2]).unwrap();
+        trainer.add_group(rows, moving(&times[1..]), &[1.0; 3]);
+        trainer.state.field.tracks.as_mut().unwrap().groups[0].deformed = false;
+        trainer.state.gradients = Gradients::zeros(&trainer.state.field);
+        trainer.state.optimiser = crate::optimiser::Optimiser::new(&trainer.state.field);
+        assert_eq!(trainer.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
+
+        let poses = |trainer: &Trainer| trainer.field().tracks.as_ref().unwrap().groups[0].poses.clone();
+        let found = poses(&trainer);
+        assert_eq!(found.iter().map(|pose| pose.time).collect::<Vec<_>>(), times);
+        let (step, last) =
+            (found[1].translation - found[0].translation, found[2].translation - found[1].translation);
+        assert!(step.distance(last) < 1e-9 && step.length() > 0.5, "{found:?}");
+
+        let resumed = Trainer::resume(dataset, trainer.checkpoint(true)).unwrap();
+        assert_eq!(poses(&resumed), found);
+    }
+}
