@@ -48,9 +48,7 @@ impl Typed {
         for (key, value) in &self.settings {
             layers.typed("settings", key, value.clone())?;
         }
-        let config = layers.finish();
-        config.validate().map_err(Error::plain)?;
-        Ok(config)
+        layers.validated()
     }
 
     /// The settings before anything is known of the capture.

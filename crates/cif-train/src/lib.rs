@@ -53,6 +53,7 @@ pub mod clock;
 pub mod config;
 pub mod curve;
 pub mod density;
+mod detail;
 pub mod effects;
 mod engine;
 pub mod error;

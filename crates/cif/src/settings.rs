@@ -159,7 +159,12 @@ impl Layers<TrainConfig> {
     ///
     /// # Errors
     /// At the first setting that cannot, see [`Layers::refused`].
-    pub fn validated(self) -> Result<TrainConfig, Error> {
+    pub fn validated(mut self) -> Result<TrainConfig, Error> {
+        // A number that was asked for is the number.
+        let is_set = |name: &str| self.origins.iter().any(|(key, _)| key == name);
+        if is_set("densify.max_gaussians") && !is_set("densify.detail") {
+            self.value.densify.detail = 0.0;
+        }
         match self.value.validate() {
             Ok(()) => Ok(self.value),
             Err(error) => Err(self.refused(error.key, error.to_string())),

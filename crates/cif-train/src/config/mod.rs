@@ -257,6 +257,10 @@ pub struct DensifyConfig {
     /// No additions beyond this many Gaussians, default 20 000; those with the largest gradient or error go first. What
     /// travelling objects start with comes on top, see `motion.gaussians`, until additions by `error` take it in.
     pub max_gaussians: u32,
+    /// Pixels of detail in a training image for each Gaussian: where images show more than `max_gaussians` can, as those
+    /// of grass and gravel do, the set may have as many as twice that. Default 2.5; 4 in `draft`; 0 where `max_gaussians`
+    /// is set, and in `paper`: never more.
+    pub detail: f32,
     /// Steps between prunings, default 100; 0 never.
     pub prune_every: u32,
     /// Pruning only above this many Gaussians, default 0; 200 000 in the base code.

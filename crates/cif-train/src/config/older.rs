@@ -10,7 +10,7 @@ fn removed() -> [(&'static str, Value); 2] {
 }
 
 /// Settings that there were not, with the value that runs went by.
-fn added() -> [(&'static str, Value); 6] {
+fn added() -> [(&'static str, Value); 7] {
     [
         ("/resample/weakness", "occupancy".into()),
         ("/model/triangulate", false.into()),
@@ -18,6 +18,7 @@ fn added() -> [(&'static str, Value); 6] {
         ("/densify/rule", "gradient".into()),
         ("/stages/half_size", 0.into()),
         ("/stages/reduction", 1.into()),
+        ("/densify/detail", 0.into()),
     ]
 }
 
@@ -69,12 +70,13 @@ mod tests {
         json["densify"].as_object_mut().unwrap().remove("rule");
         json["stages"].as_object_mut().unwrap().remove("half_size");
         json["stages"].as_object_mut().unwrap().remove("reduction");
+        json["densify"].as_object_mut().unwrap().remove("detail");
         let former = TrainConfig::recorded(json.clone()).unwrap();
         assert_eq!(
             (former.resample.weakness, former.densify.rule, former.stages.half_size),
             (Weakness::Occupancy, DensifyRule::Gradient, 0.0)
         );
-        assert_eq!(former.stages.reduction, 1);
+        assert_eq!((former.stages.reduction, former.densify.detail), (1, 0.0));
         json["stages"]["tile_share"] = 0.5.into();
         let error = TrainConfig::recorded(json).unwrap_err();
         assert!(error.contains("stages.tile_share = 0.5"), "{error}");

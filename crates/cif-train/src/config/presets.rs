@@ -43,8 +43,14 @@ fn draft() -> TrainConfig {
     config.stages = StagesConfig { coarse: 150, fine: 2_000, instance: 500, ..config.stages };
     config.model.max_initial_points = 5_000;
     config.model.sh_interval = 150;
-    config.densify =
-        DensifyConfig { from: 150, until: 1_200, every: 75, max_gaussians: 12_000, ..config.densify };
+    config.densify = DensifyConfig {
+        from: 150,
+        until: 1_200,
+        every: 75,
+        max_gaussians: 12_000,
+        detail: 4.0,
+        ..config.densify
+    };
     config.resample = ResampleConfig { from: 50, until: 400, every: 50, ..config.resample };
     // They take as long as all steps together.
     config.motion.parts = false;
@@ -94,6 +100,7 @@ fn paper(layout: Layout) -> TrainConfig {
         until: 15_000,
         every: 100,
         max_gaussians: 360_000,
+        detail: 0.0,
         prune_every: 100,
         prune_min_n: 200_000,
         opacity_reset_every: 3_000,
@@ -289,6 +296,7 @@ impl Default for DensifyConfig {
             gradient_threshold: 2e-4,
             split_scale: 0.01,
             max_gaussians: 20_000,
+            detail: 2.5,
             prune_every: 100,
             prune_min_n: 0,
             prune_opacity: 0.005,

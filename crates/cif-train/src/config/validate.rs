@@ -192,6 +192,7 @@ impl TrainConfig {
         at_least("densify.every", densify.every, 1, "expected at least 1")?;
         at_least("densify.max_gaussians", densify.max_gaussians, 1, "expected at least 1")?;
         at_least("densify.views", densify.views, 1, "expected at least 1")?;
+        within("densify.detail", densify.detail, 0.0..=1e6, "expected a number of pixels, or 0")?;
         within("densify.full_at", densify.full_at, 0.0..=1.0, "expected a number in [0, 1]")?;
         within("densify.turnover", densify.turnover, 0.0..=0.5, "expected a number in [0, 0.5]")?;
         within("densify.prune_opacity", densify.prune_opacity, 0.0..=0.99, "expected a number in [0, 0.99]")?;

@@ -91,6 +91,7 @@ use crate::clock::{Clock, Seconds};
 use crate::config::{HeadName, TrainConfig};
 use crate::curve::Curve;
 use crate::density::{self, DensifyStatistics, Strategy};
+use crate::detail;
 use crate::effects::changes::Changes;
 use crate::effects::{self, Effect};
 use crate::engine::Engine;
@@ -273,6 +274,15 @@ impl Trainer {
                 ));
             }
         }
+        if let Some((most, pixels)) = detail::most_gaussians(&dataset, &frames, &config.densify)? {
+            messages.push(TrainEvent::note(format!(
+                "images show much detail, {pixels} pixels that half the size would not show: up to {most} Gaussians \
+                 instead of {} (--max-gaussians sets another number)",
+                config.densify.max_gaussians
+            )));
+            config.densify.max_gaussians = most;
+        }
+        config.densify.detail = 0.0;
         let near = match config.near {
             0.0 => field.record.drawing.near.unwrap_or_else(|| near::automatic(&dataset)),
             near => near,

@@ -155,7 +155,7 @@ fn resolve(command: &BenchHardness, layout: Layout) -> Result<TrainConfig, Error
         (config.stages.coarse, config.stages.fine, config.stages.instance) = (60, 300, 120);
         config.model.sh_interval = 60;
         config.model.max_initial_points = 2_000;
-        config.densify.max_gaussians = 2_500;
+        (config.densify.max_gaussians, config.densify.detail) = (2_500, 0.0);
         (config.densify.from, config.densify.every, config.densify.until) = (30, 30, 240);
         (config.resample.from, config.resample.every, config.resample.until) = (20, 20, 100);
     }
