@@ -370,6 +370,18 @@ mod tests {
     }
 
     #[test]
+    fn a_number_of_gaussians_that_is_asked_for_is_the_number() {
+        let detail = |set: &[&str]| {
+            let mut layers = Layers::new(TrainConfig::default());
+            set.iter().for_each(|assignment| layers.assignment(assignment).unwrap());
+            layers.validated().unwrap().densify.detail
+        };
+        assert!(detail(&["densify.every=50"]) > 0.0);
+        assert_eq!(detail(&["densify.max_gaussians=30000"]), 0.0);
+        assert_eq!(detail(&["densify.max_gaussians=30000", "densify.detail=3"]), 3.0);
+    }
+
+    #[test]
     fn values_out_of_range_name_the_line_or_the_flag_that_they_came_from() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("mine.toml");

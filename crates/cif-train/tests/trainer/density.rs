@@ -160,3 +160,30 @@ fn splitting_by_error_shows_more_with_as_many_gaussians() {
     let [error, gradient] = [DensifyRule::Error, DensifyRule::Gradient].map(psnr);
     assert!(error > gradient, "{error} dB by error, {gradient} dB by gradient");
 }
+
+/// Images that show more than a full set can get a larger one, of at most twice the size, and a run that is resumed keeps
+/// it.
+#[test]
+fn images_with_much_detail_get_more_gaussians() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 2, views: 2, ..Scene::default() });
+    let of = |detail: f32, most: u32| {
+        let mut config = config();
+        (config.densify.detail, config.densify.max_gaussians) = (detail, most);
+        Trainer::new(dataset.clone(), config).unwrap()
+    };
+    let most = |trainer: &Trainer| trainer.config().densify.max_gaussians;
+    // Outlines and floors of the balls: some pixels, far fewer than the image has.
+    let (all, few) = (most(&of(1.0, 50)), most(&of(1.0, 40_000)));
+    assert_eq!((all, few), (100, 40_000), "twice as many at most, and never fewer");
+    assert_eq!(most(&of(0.0, 50)), 50);
+    let mut trainer = of(1.0, 50);
+    let outcome = trainer.run(&mut |event, _| match event {
+        TrainEvent::Warning { message } => panic!("{message}"),
+        TrainEvent::Step { stage: Stage::Fine, .. } => Control::Stop,
+        _ => Control::Continue,
+    });
+    assert_eq!(outcome.unwrap(), Outcome::Interrupted);
+    let resumed = Trainer::resume(dataset.clone(), trainer.checkpoint(true)).unwrap();
+    assert_eq!((most(&resumed), resumed.config().densify.detail), (100, 0.0));
+}
