@@ -44,7 +44,7 @@ pub(super) struct Activations {
 }
 
 impl Activations {
-    /// What each head adds, and the floats of one row.
+    /// Of each head: its kind, the floats of a row, which may be padded, and the rows.
     pub(super) fn outputs(&self, network: &Network<'_>) -> impl Iterator<Item = (HeadKind, usize, &[f32])> {
         let heads = network.layout.heads.iter().zip(&self.outputs);
         heads.map(|(head, outputs)| (head.kind, padded(head.output.outputs), outputs.as_slice()))
