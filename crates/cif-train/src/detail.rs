@@ -10,7 +10,9 @@ use crate::frames::FrameStore;
 /// Training images that are looked at.
 const IMAGES: usize = 8;
 
-/// Least difference from the mean around it that is seen, in colours of [0, 1]: 5 of 255.
+/// Least difference from the mean around it that is seen, in colours of [0, 1]: 5 of 255. An image of a film of a model
+/// railway (640 x 360) has 93 000 such pixels, one of a lawn (480 x 270) 40 000, and those of eight other captures 2 800 to
+/// 19 000; a full set of `draft` or `standard` grows from 48 000 or 50 000 on.
 const SEEN: f64 = 5.0 / 255.0;
 
 /// Standard deviations of the noise beyond which a difference is none of it.

@@ -1,4 +1,4 @@
-//! Gradients of the deformation alone, of more rows than a task takes and of every number of feature channels.
+//! Gradients of the deformation alone, of more rows than a task takes and of several numbers of feature channels.
 
 use cif_field::Deformation;
 use cif_field::deformation::{DeformationConfig, Heads};

@@ -12,7 +12,7 @@
 //! | `instances` | the instance pass of the reference, worked out by hand |
 //! | `metamorphic` | changes to a scene that must not change its image |
 //! | `blend` | values per Gaussian, blended and differentiated |
-//! | `deformation` | gradients of the deformation alone
+//! | `deformation` | gradients of the deformation alone |
 //! | `bands`, `tracks` | views drawn in bands, recorded motion |
 //! | `gpu`, `gpu_counts` | stages on the GPU with the reference's own inputs, and what only a GPU does |
 #![allow(clippy::unwrap_used)] // Helpers of tests.

@@ -49,23 +49,24 @@ impl Span {
 /// beside them over as long a time, or over all of them where they last less, and then for no longer. `None` without two
 /// poses.
 fn continued(poses: &[TrackPose], time: f64, reach: f64) -> Option<TrackPose> {
-    let ascending: Vec<&TrackPose> =
+    let inwards: Vec<&TrackPose> =
         if time < poses.first()?.time { poses.iter().collect() } else { poses.iter().rev().collect() };
-    let nearest = ascending[0];
+    let nearest = inwards[0];
     let away = |pose: &TrackPose| (pose.time - nearest.time).abs();
     let gap = (time - nearest.time).abs().min(reach);
-    let other = ascending.iter().skip(1).find(|pose| away(pose) >= gap).or(ascending.last())?;
+    let other = inwards.iter().skip(1).find(|pose| away(pose) >= gap).or(inwards.last())?;
     if away(other) == 0.0 {
         return None;
     }
     let share = (gap / away(other)).min(1.0);
     let turn = nearest.rotation * other.rotation.conjugate();
     let turn = if turn.w < 0.0 { -turn } else { turn };
+    // By half a turn at most, which leaves it in the hemisphere of the nearest.
     let turned = DQuat::from_scaled_axis(turn.to_scaled_axis() * share) * nearest.rotation;
     Some(TrackPose {
         time,
         translation: nearest.translation + share * (nearest.translation - other.translation),
-        rotation: if turned.dot(nearest.rotation) < 0.0 { -turned } else { turned.normalize() },
+        rotation: turned.normalize(),
     })
 }
 
