@@ -661,7 +661,14 @@ fn paths_of_moving_objects_are_drawn() {
 fn a_plan_looks_for_points_as_training_does() {
     let folder = with_capture(4);
     let path = folder.path();
-    assert!(!cif(path, "plan table").succeeds().stderr.contains("no points"));
+    let plan = cif(path, "plan table").succeeds();
+    assert!(!plan.stderr.contains("no points"));
+    assert!(plan.stdout.contains("\nexpected: ") && plan.stdout.contains(" of memory"), "{}", plan.stdout);
+    let report = cif(path, "plan table --preset draft --json").succeeds().stdout;
+    let report: Value = serde_json::from_str(&report).unwrap();
+    let expected = |key: &str| report["expected"][key].as_f64().unwrap();
+    assert!(expected("steps_s") > 0.0 && expected("memory_bytes") > 1e7, "{report}");
+    assert!(expected("measured_steps") >= 3.0 && report["threads"].as_u64() >= Some(1), "{report}");
     fs::remove_file(path.join("table/points.npy")).unwrap();
     let plan = cif(path, "plan table").succeeds();
     assert!(plan.stderr.contains("it has no points"), "{}", plan.stderr);

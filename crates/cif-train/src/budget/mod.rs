@@ -7,7 +7,9 @@ use serde::{Deserialize, Serialize};
 use crate::clock::Seconds;
 
 pub use pacer::{COARSE, INSTANCE, OtherWork, Pacer, Part, StageShare, StepCosts};
-pub(crate) use pacer::{FITS, IDENTITY_STEPS_PER_FRAME, REHEARSAL, TRIALS, weights};
+pub(crate) use pacer::{
+    FITS, IDENTITY_STEPS_PER_FRAME, MOVING, PIXELS_OF_FIT, REHEARSAL, TRAVELS, TRIALS, weights,
+};
 
 /// Which time a budget counts.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -1,12 +1,9 @@
 //! Which settings fit a budget: steps, Gaussians and, where nothing else helps, resolution.
 
 use super::Calibration;
-use crate::budget::{COARSE, FITS, INSTANCE};
+use super::expected::{Workload, steps_s};
+use crate::budget::FITS;
 use crate::config::TrainConfig;
-use crate::working_size;
-
-/// Mean Gaussians of the fine stage as a share of the most.
-const MEAN_GAUSSIANS: f64 = 0.8;
 
 /// Exponent by which Gaussians follow the budget: `draft` has 0.6 of `standard` in 0.3 of its time, and in a tenth of it
 /// 0.2 to 0.4 of them were best on two captures.
@@ -18,24 +15,14 @@ const GAUSSIANS_RANGE: (f64, f64) = (0.125, 2.0);
 /// Most steps relative to the settings to start from; more bring next to nothing.
 const MOST_STEPS: f64 = 4.0;
 
+/// Rounds in which steps are fitted to the time.
+const ROUNDS: usize = 4;
+
 /// Fine steps below which images are reduced.
 const FEWEST_FINE_STEPS: f64 = 700.0;
 
 /// Shorter side that images keep at least, pixels.
 const SMALLEST_IMAGE: u32 = 64;
-
-/// Facts about a run, besides its settings, that decide its cost and the settings that may change.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Workload {
-    /// More than one time.
-    pub is_dynamic: bool,
-    /// Masks with labelled pixels.
-    pub has_instances: bool,
-    /// Images may be reduced.
-    pub may_reduce: bool,
-    /// Gaussians may be changed.
-    pub may_change_gaussians: bool,
-}
 
 /// A setting that differs from where the choice started.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -61,39 +48,19 @@ pub struct Choice {
     pub changes: Vec<Change>,
 }
 
-/// Expected seconds of all stages.
-fn expected_s(config: &TrainConfig, calibration: &Calibration, work: Workload, reduction: u32) -> f64 {
-    let most = f64::from(config.densify.max_gaussians);
-    // Densification may start with more than it may add up to.
-    let mean = (MEAN_GAUSSIANS * most).max(calibration.gaussians.min(most as usize) as f64);
-    let size = calibration.image_size.map(|side| side / reduction);
-    let working = working_size::of_size(size, config);
-    let costs = working_size::step_costs(size.map(|side| side / working), working, &config.stages);
-    let (halved, whole) = (costs.first.share, costs.last.share);
-    let few = calibration.step_s(calibration.gaussians.min(most as usize) as f64, reduction * working);
-    let fine = f64::from(config.fine_iterations())
-        * (halved * calibration.step_s(mean, 2 * reduction * working)
-            + whole * calibration.step_s(mean, reduction)
-            + (1.0 - halved - whole) * calibration.step_s(mean, reduction * working));
-    let coarse = f64::from(config.stages.coarse) * few * if work.is_dynamic { COARSE } else { 1.0 };
-    let instance =
-        f64::from(config.stages.instance) * INSTANCE * calibration.step_s(most, reduction * working);
-    coarse + fine + if work.has_instances { instance } else { 0.0 }
-}
-
 /// Part of a budget that fits of objects may take before and between the stages; 0 where there are none.
 #[must_use]
 pub fn share_of_fits(config: &TrainConfig, work: Workload) -> f64 {
-    let motion = &config.motion;
-    let are_fitted =
-        motion.rigid && motion.guidance > 0.0 && config.effects.motion && config.effects.instances;
-    if are_fitted && work.is_dynamic && work.has_instances { FITS } else { 0.0 }
+    if work.has_fits(config) { FITS } else { 0.0 }
 }
 
 /// Settings like `base` that take about `seconds`.
 #[must_use]
 pub fn choose(base: &TrainConfig, calibration: &Calibration, work: Workload, seconds: f64) -> Choice {
-    let base_s = expected_s(base, calibration, work, 1).max(1e-6);
+    let mut base = base.clone();
+    (base.densify.max_gaussians, base.densify.detail) = (calibration.most, 0.0);
+    let base = &base;
+    let base_s = steps_s(base, calibration, work, 1).max(1e-6);
     let share = (seconds / base_s).max(1e-6);
     let mut config = base.clone();
     if work.may_change_gaussians {
@@ -110,8 +77,13 @@ pub fn choose(base: &TrainConfig, calibration: &Calibration, work: Workload, sec
     let side = calibration.image_size[0].min(calibration.image_size[1]);
     let mut reduction = 1;
     loop {
-        let whole = expected_s(&config, calibration, work, reduction).max(1e-6);
-        let factor = (seconds / whole).min(MOST_STEPS);
+        // Costs are nearly in proportion to steps.
+        let mut factor = 1.0;
+        for _ in 0..ROUNDS {
+            set_schedule(&mut config, base, factor);
+            let whole = steps_s(&config, calibration, work, reduction).max(1e-6);
+            factor = (factor * seconds / whole).min(MOST_STEPS);
+        }
         let fine = f64::from(base.fine_iterations()) * factor;
         if fine >= FEWEST_FINE_STEPS || !work.may_reduce || side / (2 * reduction) < SMALLEST_IMAGE {
             set_schedule(&mut config, base, factor);
@@ -122,7 +94,7 @@ pub fn choose(base: &TrainConfig, calibration: &Calibration, work: Workload, sec
     if reduction > 1 {
         config.downscale = Some(base.downscale.unwrap_or(1) * reduction);
     }
-    let expected_s = expected_s(&config, calibration, work, reduction);
+    let expected_s = steps_s(&config, calibration, work, reduction);
     let changes = changes(base, &config, work, calibration.image_size, reduction);
     Choice { config, base_s, expected_s, changes }
 }
@@ -190,15 +162,26 @@ fn changes(
 mod tests {
     use super::*;
 
-    const WORK: Workload =
-        Workload { is_dynamic: true, has_instances: true, may_reduce: true, may_change_gaussians: true };
+    const WORK: Workload = Workload {
+        is_dynamic: true,
+        has_instances: true,
+        frames: 50,
+        travelling: 0,
+        resting: 0,
+        may_reduce: true,
+        may_change_gaussians: true,
+    };
 
-    /// 27 ms per step at 9 600 Gaussians, as measured on a capture of 256 x 192.
+    /// 40 ms per step with a full set, on a capture of 256 x 192.
     const MEASURED: Calibration = Calibration {
+        initial: 5_000,
+        most: 20_000,
         gaussians: 5_000,
         step_s: 0.016,
         pixel_share: 0.3,
         fixed_share: 0.1,
+        moving_share: 0.0,
+        moving: 1.0,
         image_size: [256, 192],
         steps: 20,
     };

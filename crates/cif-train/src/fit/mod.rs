@@ -1,12 +1,15 @@
-//! Settings that fit a time budget on this machine and this capture.
+//! What a run takes on this machine and this capture, and settings that fit a time budget.
 //!
 //! | file | answers |
 //! |---|---|
 //! | `calibrate` | what a step costs here |
+//! | `expected` | how long a run takes, and how much memory |
 //! | `choose` | which settings fit the budget, and what they give up |
 
 mod calibrate;
 mod choose;
+mod expected;
 
 pub use calibrate::{Calibration, calibrate};
-pub use choose::{Change, Choice, Workload, choose, share_of_fits, stretched};
+pub use choose::{Change, Choice, choose, share_of_fits, stretched};
+pub use expected::{Expected, Workload};

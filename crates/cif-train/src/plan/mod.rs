@@ -42,11 +42,13 @@ const HEAD_GAIN: f32 = 0.005;
 const GUIDANCE: f32 = 10.0;
 const STILLNESS: f32 = 1.0;
 
-/// All effects of a capture. Serialises as `{"effects": [{effect, decision, evidence, cost, flag}, ...]}`.
+/// All effects of a capture.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
 pub struct EffectPlan {
     /// In the order of [`EffectKind`].
     pub effects: Vec<Effect>,
+    /// Labels of the instances that travel by their masks.
+    pub travelling: Vec<String>,
 }
 
 impl EffectPlan {
@@ -69,7 +71,7 @@ impl EffectPlan {
         phases: &Phases,
     ) -> Result<Self, TrainError> {
         let evidence = Evidence::of(dataset, phases)?;
-        Ok(Self { effects: decide(&evidence, config, choice) })
+        Ok(Self { effects: decide(&evidence, config, choice), travelling: evidence.travelling })
     }
 
     /// Decision on an effect.

@@ -28,9 +28,13 @@ fn exposed(cameras: usize, between_cameras: f64, in_time: Option<f64>) -> Option
     Some(Exposures { cameras, between_cameras, in_time })
 }
 
+fn of(effects: Vec<Effect>) -> EffectPlan {
+    EffectPlan { effects, travelling: Vec::new() }
+}
+
 fn plan(found: &Evidence, choice: &str) -> (EffectPlan, TrainConfig) {
     let mut config = TrainConfig::default();
-    let plan = EffectPlan { effects: decide(found, &config, &choice.parse().unwrap()) };
+    let plan = of(decide(found, &config, &choice.parse().unwrap()));
     plan.apply(&mut config);
     config.validate().unwrap();
     (plan, config)
@@ -85,7 +89,7 @@ fn switches_win_over_the_evidence() {
     assert_eq!((config.motion.guidance, config.model.sh_degree), (0.0, 0));
     assert!(!config.model.heads.scale && config.model.heads.position);
     let mut paper = TrainConfig::preset(crate::Preset::Paper, cif_dataset::Layout::HyperNerf);
-    EffectPlan { effects: decide(&found(), &paper, &"all,+guidance".parse().unwrap()) }.apply(&mut paper);
+    of(decide(&found(), &paper, &"all,+guidance".parse().unwrap())).apply(&mut paper);
     assert_eq!((paper.motion.guidance, paper.motion.stillness), (GUIDANCE, STILLNESS));
     let none = self::plan(&found(), "none").1;
     assert!(!none.effects.motion && !none.effects.instances && none.model.sh_degree == 0);
@@ -140,7 +144,7 @@ fn the_motion_that_is_tried_is_told_object_by_object() {
     let found = Evidence { travelling: vec!["ball".to_owned(), "scarf".to_owned()], ..found() };
     let mut told = TrainConfig::default();
     told.motion.of.insert("scarf".to_owned(), ObjectMotion::Free);
-    let plan = EffectPlan { effects: decide(&found, &told, &"auto".parse().unwrap()) };
+    let plan = of(decide(&found, &told, &"auto".parse().unwrap()));
     let Some(Decision::Value(words)) = plan.decision(EffectKind::Objects) else { panic!("{plan:?}") };
     assert!(
         words.starts_with("rigid, if pixels left out agree, else free: ball; free: scarf (told);"),

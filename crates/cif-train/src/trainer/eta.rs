@@ -2,8 +2,10 @@
 
 use std::time::Duration;
 
+use cif_field::Deformation;
+
 use super::Trainer;
-use crate::budget::{COARSE, IDENTITY_STEPS_PER_FRAME, INSTANCE};
+use crate::budget::{COARSE, IDENTITY_STEPS_PER_FRAME, INSTANCE, MOVING, PIXELS_OF_FIT, TRAVELS};
 use crate::config::DensifyRule;
 use crate::phase::Phase;
 use crate::schedule::{Due, may_halve};
@@ -11,24 +13,21 @@ use crate::stage::Stage;
 use crate::times::StepTimes;
 use crate::working_size::PIXEL_SHARE;
 
-/// Time of a fit of an object that travels, of that of one that turns out to rest: the first has about 32 000 steps, the
-/// second 4 700, each in two sizes of one capture.
-const TRAVELS: f64 = 7.0;
-
 /// Steps of a stage that are looked at for what all of it costs.
 const SAMPLES: u32 = 200;
 
-/// Shares of a step that grow with pixels, and with neither these nor Gaussians.
+/// Shares of a step that grow with pixels, with Gaussians that move, and with neither pixels nor Gaussians.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Shares {
     pixels: f64,
+    moving: f64,
     fixed: f64,
 }
 
 impl Default for Shares {
     /// Where parts of steps are not timed, as on GPUs.
     fn default() -> Self {
-        Self { pixels: PIXEL_SHARE, fixed: 0.0 }
+        Self { pixels: PIXEL_SHARE, moving: 0.0, fixed: 0.0 }
     }
 }
 
@@ -36,18 +35,24 @@ impl Shares {
     /// Of the steps between two times; `None` where there were none, or their parts were not timed.
     fn of(now: &StepTimes, since: &StepTimes) -> Option<Self> {
         let pixels = |of: &StepTimes| of.render.rasterize + of.render.rasterize_backward + of.losses;
+        let moving = |of: &StepTimes| of.render.deform + of.render.deform_backward;
         let fixed = |of: &StepTimes| of.optimiser_planes + of.optimiser_mlp;
         let between = |part: fn(&StepTimes) -> Duration| part(now).saturating_sub(part(since)).as_secs_f64();
         let total = between(|of| of.total);
+        let share = |seconds: f64| (seconds / total).min(1.0);
         let pixels = between(pixels);
-        (total > 0.0 && pixels > 0.0)
-            .then(|| Self { pixels: (pixels / total).min(1.0), fixed: (between(fixed) / total).min(1.0) })
+        (total > 0.0 && pixels > 0.0).then(|| Self {
+            pixels: share(pixels),
+            moving: share(between(moving)),
+            fixed: share(between(fixed)),
+        })
     }
 
-    /// Cost of a step with so many times the pixels and Gaussians, relative to those that were timed.
-    fn cost(&self, pixels: f64, gaussians: f64) -> f64 {
-        let rows = (1.0 - self.pixels - self.fixed).max(0.0);
-        self.pixels * pixels + self.fixed + rows * gaussians
+    /// Cost of a step with so many times the pixels and Gaussians, and the share of these that moves, relative to those
+    /// that were timed.
+    fn cost(&self, pixels: f64, gaussians: f64, moving: f64) -> f64 {
+        let rows = (1.0 - self.pixels - self.moving - self.fixed).max(0.0);
+        self.pixels * pixels + self.fixed + (rows + self.moving * moving) * gaussians
     }
 }
 
@@ -78,9 +83,12 @@ impl Trainer {
         let done = |of: Stage| if of == stage { self.state.progress.iteration } else { 0 };
         let gaussians = self.state.field.gaussians.len() as f64;
         let last = self.pixels_of_step(stage, done(stage).max(1));
+        let test = self.first_test(stage);
         let cost_of = |of: Stage, step: u32, pixels: f64| {
             let more = self.gaussians_at(of, step) / gaussians.max(1.0);
-            shares.cost(pixels / last, more) * cost(of) / cost(stage)
+            let is_behind = test.is_some_and(|test| of > stage || step > test);
+            let moving = if is_behind { MOVING } else { 1.0 };
+            shares.cost(pixels / last, more, moving) * cost(of) / cost(stage)
         };
         // Costs change slowly but for a few steps, so that some stand for all.
         let left = |of: Stage| {
@@ -100,6 +108,17 @@ impl Trainer {
             * cost_of(Stage::Fine, all(Stage::Fine), 1.0);
         let fits_s = if stage == Stage::Coarse { self.fits_s() } else { 0.0 };
         (stages.map(left).sum::<f64>() + identity) / rate.max(1e-9) + fits_s
+    }
+
+    /// The step of the fine stage that looks for Gaussians that stand still before any does; `None` where this step does not
+    /// come.
+    fn first_test(&self, stage: Stage) -> Option<u32> {
+        let still = |deformation: &Deformation| deformation.still.contains(&true);
+        if stage != Stage::Fine || self.state.field.deformation.as_ref().is_none_or(still) {
+            return None;
+        }
+        let steps = self.state.progress.iteration + 1..=self.stages.iterations(&self.state.config, stage);
+        steps.into_iter().find(|step| self.moment(stage, *step, 0).has(Due::TestStill))
     }
 
     /// Pixels of the images of a step, relative to those that are worked on.
@@ -133,13 +152,25 @@ impl Trainer {
         now * (most / now.max(1.0)).powf(way)
     }
 
-    /// Estimated seconds of the fits to come, by those of objects that were tried before; 0 where none was.
+    /// Estimated seconds of the fits to come, by those of objects that were tried before, or by the steps of the coarse
+    /// stage where none was.
     fn fits_s(&self) -> f64 {
         let others = self.state.guidance.travelling.iter().skip(1).filter(|travels| !**travels).count();
         // In units of fits of objects that rest.
         let tried = others as f64 + TRAVELS * self.state.objects.moving_count() as f64;
         let spent = self.state.phases.spent(Phase::Search).wall_s;
-        if tried > 0.0 { TRAVELS * self.objects_to_fit() as f64 * spent / tried } else { 0.0 }
+        let objects = self.objects_to_fit() as f64;
+        if tried > 0.0 { TRAVELS * objects * spent / tried } else { objects * PIXELS_OF_FIT * self.pixel_s() }
+    }
+
+    /// Seconds that the coarse steps took for each pixel of their images; 0 where their parts were not timed.
+    fn pixel_s(&self) -> f64 {
+        let StepTimes { render, losses, views, .. } = &self.state.times;
+        let spent = render.rasterize + render.rasterize_backward + *losses;
+        let camera = &self.state.dataset.frames[self.state.frames.index(0)].camera;
+        let pixels =
+            f64::from(camera.width) * f64::from(camera.height) * self.pixels_of_step(Stage::Coarse, 1);
+        spent.as_secs_f64() / (pixels * *views as f64).max(1.0)
     }
 }
 
@@ -150,15 +181,37 @@ mod tests {
 
     #[test]
     fn costs_grow_with_what_the_parts_of_steps_grow_with() {
-        let shares = Shares { pixels: 0.5, fixed: 0.2 };
-        assert!((shares.cost(1.0, 1.0) - 1.0).abs() < 1e-12);
-        assert!((shares.cost(4.0, 2.0) - (2.0 + 0.2 + 0.6)).abs() < 1e-12);
+        let shares = Shares { pixels: 0.5, moving: 0.1, fixed: 0.2 };
+        assert!((shares.cost(1.0, 1.0, 1.0) - 1.0).abs() < 1e-12);
+        assert!((shares.cost(4.0, 2.0, 1.0) - (2.0 + 0.2 + 0.6)).abs() < 1e-12);
+        assert!((shares.cost(1.0, 2.0, 0.5) - (0.5 + 0.2 + 2.0 * (0.2 + 0.05))).abs() < 1e-12);
         let since = StepTimes { total: Duration::from_secs(1), ..StepTimes::default() };
         let mut now = StepTimes { total: Duration::from_secs(5), ..since };
         assert_eq!(Shares::of(&now, &since), None, "parts are not timed");
         (now.losses, now.optimiser_mlp) = (Duration::from_secs(1), Duration::from_secs(2));
-        assert_eq!(Shares::of(&now, &since), Some(Shares { pixels: 0.25, fixed: 0.5 }));
+        now.render.deform = Duration::from_millis(500);
+        assert_eq!(Shares::of(&now, &since), Some(Shares { pixels: 0.25, moving: 0.125, fixed: 0.5 }));
         assert_eq!(Shares::of(&since, &since), None);
+    }
+
+    #[test]
+    fn fits_to_come_are_known_by_the_coarse_steps_where_none_was_tried() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), Scene { times: 3, views: 4, ..Scene::default() });
+        let mut config = small_config();
+        (config.motion.rigid, config.motion.guidance) = (true, 1.0);
+        let mut trainer = Trainer::new(dataset, config).unwrap();
+        assert_eq!(trainer.fits_s(), 0.0, "nothing travels");
+        trainer.state.guidance.travelling = vec![false, true, true];
+        assert_eq!(trainer.objects_to_fit(), 2);
+        assert_eq!(trainer.fits_s(), 0.0, "no step was timed");
+        // 20 ns for each pixel of ten views.
+        let camera = &trainer.state.dataset.frames[trainer.state.frames.index(0)].camera;
+        let pixels = f64::from(camera.width) * f64::from(camera.height);
+        trainer.state.times.views = 10;
+        trainer.state.times.losses = Duration::from_secs_f64(10.0 * pixels * 20e-9);
+        let fits_s = trainer.fits_s();
+        assert!((fits_s / (2.0 * PIXELS_OF_FIT * 20e-9) - 1.0).abs() < 1e-3, "{fits_s}");
     }
 
     #[test]
@@ -185,7 +238,7 @@ mod tests {
         assert_eq!(trainer.gaussians_at(Stage::Fine, 90), now, "nobody knows");
         // A step on half-size images takes a second; parts are not timed.
         let eta_s = trainer.eta_s(Stage::Fine, 1.0, &StepTimes::default());
-        let cost = |pixels: f64| Shares::default().cost(4.0 * pixels, 1.0);
+        let cost = |pixels: f64| Shares::default().cost(4.0 * pixels, 1.0, 1.0);
         let identity = IDENTITY_STEPS_PER_FRAME * trainer.frames_of_identities(Stage::Fine) as f64;
         let expected = 40.0 + (40.0 + identity) * cost(1.0) + 20.0 * cost(4.0);
         assert!((eta_s / expected - 1.0).abs() < 1e-6, "{eta_s} {expected}");
@@ -193,8 +246,17 @@ mod tests {
         trainer.state.progress.iteration = 80;
         let eta_s = trainer.eta_s(Stage::Fine, 2.0, &StepTimes::default());
         assert!(
-            (eta_s / (10.0 * Shares::default().cost(4.0, 1.0) + 0.5 * identity) - 1.0).abs() < 1e-6,
+            (eta_s / (10.0 * Shares::default().cost(4.0, 1.0, 1.0) + 0.5 * identity) - 1.0).abs() < 1e-6,
             "{eta_s}"
         );
+        // Before it is known what stands still, fewer will move behind the first test.
+        trainer.shows_changes = false;
+        trainer.state.config.effects.still_every = 10;
+        (trainer.state.config.effects.still_from, trainer.state.progress.iteration) = (0.3, 10);
+        assert_eq!(trainer.first_test(Stage::Fine), Some(30));
+        assert_eq!(trainer.first_test(Stage::Coarse), None);
+        let count = trainer.field().gaussians.len();
+        trainer.state.field.deformation.as_mut().unwrap().still = vec![true; count];
+        assert_eq!(trainer.first_test(Stage::Fine), None, "it is known");
     }
 }

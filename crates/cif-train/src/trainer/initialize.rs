@@ -109,7 +109,7 @@ pub(super) fn initial_deformation(
 ///
 /// # Errors
 /// When there is no such deformation, or memory cannot hold it in training.
-pub(super) fn deformation_shape(
+pub(crate) fn deformation_shape(
     dataset: &Dataset,
     config: &TrainConfig,
 ) -> Result<DeformationConfig, TrainError> {
@@ -136,7 +136,7 @@ pub(super) fn deformation_shape(
 const COPIES: u64 = 4;
 
 /// Memory that so many Gaussians take in training.
-pub(super) fn memory_of_gaussians(count: u32) -> Need {
+pub(crate) fn memory_of_gaussians(count: u32) -> Need {
     let of_gaussians = TABLE.iter().filter(|parameter| parameter.rows == Rows::Gaussians);
     let floats: u64 = of_gaussians.map(|parameter| parameter.width() as u64).sum();
     Need {
@@ -148,7 +148,7 @@ pub(super) fn memory_of_gaussians(count: u32) -> Need {
 }
 
 /// Memory that the planes of a deformation take in training.
-fn memory_of_planes(shape: &DeformationConfig) -> Need {
+pub(crate) fn memory_of_planes(shape: &DeformationConfig) -> Need {
     let floats = shape.plane_layout().1 as u64;
     let [x, y, z] = shape.spatial_resolution;
     Need {

@@ -3,12 +3,15 @@
 use cif_dataset::Dataset;
 use cif_field::parameters::LOG_CALIBRATIONS;
 use cif_field::{Field, Identities, Instance};
+use cif_render::Gradients;
 
 use super::evaluate::MeasuredFrames;
 use super::resume::check_instances;
 use super::{Trainer, initialize};
 use crate::config::TrainConfig;
+use crate::density::with_copies;
 use crate::error::TrainError;
+use crate::random::{Purpose, stream};
 use crate::stage::Stage;
 use crate::times::StepTimes;
 
@@ -92,6 +95,34 @@ impl Trainer {
         let result = self.step(&mut Vec::new());
         self.instance_pass = InstancePass::On;
         result.map(|_| self.times())
+    }
+
+    /// Splits Gaussians, as densification does, until the set is full, and lets all but a share of them stand still: steps
+    /// like those that most of the fine stage consists of.
+    ///
+    /// # Panics
+    /// When the share is not in [0, 1].
+    pub fn fill(&mut self, moving: f64) {
+        assert!((0.0..=1.0).contains(&moving), "{moving} of the Gaussians cannot move");
+        let most = self.state.config.densify.max_gaussians as usize;
+        let mut rng = stream(self.state.config.seed, Purpose::Split, 0);
+        loop {
+            let count = self.state.field.gaussians.len();
+            let more = most.saturating_sub(count).min(count);
+            if more == 0 {
+                break;
+            }
+            let rows: Vec<u32> = (0..more).map(|k| (k * count / more) as u32).collect();
+            let change = with_copies(&self.state.field.gaussians, &[], &rows, &mut rng);
+            self.rearrange(change);
+        }
+        let count = self.state.field.gaussians.len();
+        if let Some(deformation) = &mut self.state.field.deformation {
+            // Spread evenly over the rows.
+            let before = |row: usize| (moving * row as f64).floor();
+            deformation.still = (0..count).map(|row| before(row + 1) == before(row)).collect();
+            self.state.gradients = Gradients::zeros(&self.state.field);
+        }
     }
 
     /// Makes the next step take the views of the last one again.
@@ -178,7 +209,29 @@ fn relabel(rows: &mut Identities, new_label: impl Fn(u16) -> u16) -> Vec<Option<
 
 #[cfg(test)]
 mod tests {
+    use super::super::guard_tests::support::{Scene, capture, small_config};
     use super::*;
+
+    #[test]
+    fn a_full_set_has_as_many_as_there_may_be_and_a_share_of_them_moves() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), Scene { times: 3, views: 4, ..Scene::default() });
+        let mut trainer = Trainer::for_measuring(dataset, small_config(), None, Stage::Fine, 0).unwrap();
+        let initial = trainer.field().gaussians.len();
+        let most = 5 * initial + 3;
+        trainer.state.config.densify.max_gaussians = most as u32;
+        trainer.fill(0.3);
+        let moving = |trainer: &Trainer| {
+            let field = trainer.field();
+            field.deformation.as_ref().unwrap().moving_rows(field.gaussians.len()).count()
+        };
+        assert_eq!(trainer.field().gaussians.len(), most);
+        assert_eq!(moving(&trainer), (0.3 * most as f64).floor() as usize);
+        trainer.measure_step(InstancePass::Off).unwrap();
+        // A set that is full already stays.
+        trainer.fill(1.0);
+        assert_eq!((trainer.field().gaussians.len(), moving(&trainer)), (most, most));
+    }
 
     #[test]
     fn spreading_is_a_permutation_of_any_size() {

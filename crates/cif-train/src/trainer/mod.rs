@@ -81,7 +81,9 @@ use cif_render::{Gradients, UNLABELLED};
 #[cfg(feature = "wgpu")]
 pub use self::backend::Probe;
 use self::evaluate::MeasuredFrames;
-pub(crate) use self::initialize::automatic_time_nodes;
+pub(crate) use self::initialize::{
+    automatic_time_nodes, deformation_shape, memory_of_gaussians, memory_of_planes,
+};
 pub use self::measure::InstancePass;
 use self::pacing::Pacing;
 use self::resume::SavedHead;

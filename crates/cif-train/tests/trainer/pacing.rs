@@ -173,12 +173,13 @@ fn steps_are_measured_and_settings_chosen() {
     let base = small_config();
     let calibration = calibrate(&dataset, &base, &clock, BudgetClock::Wall, 1, 0.5).unwrap();
     assert_eq!(calibration.image_size, [crate::support::WIDTH, crate::support::HEIGHT]);
-    assert_eq!(calibration.gaussians, 450);
+    // As many as there will be.
+    assert_eq!((calibration.initial, calibration.most, calibration.gaussians), (450, 800, 800));
     // The clock is read around all steps, and after each from the third on.
     assert_eq!(calibration.steps, 7);
     assert!((calibration.step_s - 0.6 / 7.0).abs() < 1e-9, "{calibration:?}");
-    let work =
-        Workload { is_dynamic: true, has_instances: true, may_reduce: true, may_change_gaussians: true };
+    let work = Workload::of(&dataset, 0);
+    assert_eq!((work.is_dynamic, work.has_instances, work.frames), (true, true, 12));
     let choice = choose(&base, &calibration, work, 20.0);
     assert!(choice.config.stages.fine < base.stages.fine && choice.config.downscale.is_none());
     choice.config.validate().unwrap();

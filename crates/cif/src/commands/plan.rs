@@ -1,21 +1,32 @@
-//! `cif plan`: which effects a capture calls for.
+//! `cif plan`: which effects a capture calls for, and what a run with them takes.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
-use cif_train::{EffectChoice, EffectPlan, Stop, TrainConfig};
+use cif_dataset::Dataset;
+use cif_train::budget::BudgetClock;
+use cif_train::fit::{Expected, Workload, calibrate};
+use cif_train::{Clock, EffectChoice, EffectPlan, Stop, SystemClock, TrainConfig};
 use clap::Args;
+use serde::Serialize;
 
 use crate::commands::shared::named::preset;
 use crate::commands::shared::{CaptureOptions, print_warnings};
 use crate::error::Error;
+use crate::progress::duration;
 use crate::report::{JsonReport, OnlyReport};
 use crate::{interrupt, starting_points};
 
-/// Show which effects a capture needs, and their cost
+/// Most seconds of measuring steps, once three are done.
+const MEASURING_S: f64 = 2.0;
+
+/// Show which effects a capture needs, and how long training would take
 #[derive(Debug, Args)]
 #[command(after_help = "\
 `cif train` follows this plan (unless the preset is paper, or --effects says otherwise) and records it in the scene.
 Points of a capture that has none are triangulated first, as in training, which takes some seconds.
+The time comes from some steps that are measured here and now, beside whatever else the machine does; fits of
+objects may take half or twice as long.
 Each line names the flag of `cif train` that overrides it; settings on the command line or in a
 --config file override the plan.
 
@@ -37,7 +48,19 @@ pub(super) struct Plan {
     capture_options: CaptureOptions,
 }
 
-impl JsonReport for EffectPlan {
+/// Effects of a capture, and what a run with them is expected to take.
+#[derive(Serialize)]
+struct PlanReport {
+    /// Effects.
+    #[serde(flatten)]
+    plan: EffectPlan,
+    /// Time and memory of a run.
+    expected: Expected,
+    /// Threads that the time is for.
+    threads: usize,
+}
+
+impl JsonReport for PlanReport {
     const COMMANDS: &'static [&'static str] = &["cif plan"];
 }
 
@@ -52,10 +75,24 @@ pub(super) fn run(command: &Plan) -> Result<(), Error> {
     }
     print_warnings(&dataset);
     let plan = EffectPlan::new(&dataset, &config, &command.effects).map_err(Error::plain)?;
-    command.report.give(|| plan.clone(), || print(&plan))
+    let expected = expected(&dataset, config, &plan)?;
+    let report = || PlanReport { plan: plan.clone(), expected, threads: rayon::current_num_threads() };
+    command.report.give(report, || print(&plan, &expected))
 }
 
-fn print(plan: &EffectPlan) {
+/// Time and memory of a run on this machine, by steps that are measured.
+fn expected(dataset: &Dataset, mut config: TrainConfig, plan: &EffectPlan) -> Result<Expected, Error> {
+    plan.apply(&mut config);
+    let clock: Arc<dyn Clock> = Arc::new(SystemClock::start());
+    let threads = rayon::current_num_threads();
+    let calibration =
+        calibrate(dataset, &config, &clock, BudgetClock::Wall, threads, MEASURING_S).map_err(Error::plain)?;
+    config.densify.max_gaussians = calibration.most;
+    let work = Workload::of(dataset, plan.travelling.len());
+    Expected::of(dataset, &config, &calibration, work).map_err(Error::plain)
+}
+
+fn print(plan: &EffectPlan, expected: &Expected) {
     let mut table = crate::commands::shared::table(["effect", "decision", "evidence", "cost", "otherwise"]);
     for effect in &plan.effects {
         table.add_row([
@@ -67,4 +104,15 @@ fn print(plan: &EffectPlan) {
         ]);
     }
     println!("{table}");
+    let fits = match plan.travelling.len() {
+        _ if expected.fits_s <= 0.0 => String::new(),
+        objects => format!(", {} of it fits of {objects} objects", duration(expected.fits_s)),
+    };
+    println!(
+        "expected: {}{fits}, on {} threads of this machine ({} steps measured); {:.1} GB of memory",
+        duration(expected.steps_s + expected.fits_s),
+        rayon::current_num_threads(),
+        expected.measured_steps,
+        expected.memory_bytes as f64 / 1e9
+    );
 }

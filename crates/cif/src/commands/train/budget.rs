@@ -129,10 +129,9 @@ impl Goals {
         let calibration = calibrate(&dataset, config, &timing.clock, budget.clock, budget.threads, limit)
             .map_err(Error::plain)?;
         let work = Workload {
-            is_dynamic: dataset.times.len() > 1,
-            has_instances: dataset.frames.iter().any(|frame| frame.mask.is_some()),
             may_reduce: capture.downscale.is_none() && config.downscale == preset.downscale,
             may_change_gaussians: config.densify.max_gaussians == preset.densify.max_gaussians,
+            ..Workload::of(&dataset, 0)
         };
         drop(phase);
         let left = (budget.seconds - budget.used(timing.clock.now())).max(0.0);
