@@ -19,7 +19,7 @@ const SEEN: f64 = 5.0 / 255.0;
 const DEVIATIONS: f64 = 3.0;
 
 /// Most Gaussians of a full set, of those in its settings: what it costs is bounded, too.
-const MOST: f64 = 2.0;
+pub(crate) const MOST: f64 = 2.0;
 
 /// Gaussians that a full set may have, and the pixels of detail in an image that ask for them: one for each
 /// `densify.detail` of them, but no less than `densify.max_gaussians` and no more than [`MOST`] of them. `None` where

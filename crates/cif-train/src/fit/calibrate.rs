@@ -22,7 +22,7 @@ const STEPS: (usize, usize) = (4, 64);
 pub struct Calibration {
     /// Gaussians that the run begins with.
     pub initial: usize,
-    /// Most Gaussians that densification adds up to, as the settings and the detail of the images have it.
+    /// Most Gaussians that densification adds up to with the settings and the detail of the images.
     pub most: u32,
     /// Gaussians of the steps measured.
     pub gaussians: usize,

@@ -5,6 +5,7 @@ use cif_dataset::{Dataset, Split};
 use super::Calibration;
 use crate::budget::{COARSE, IDENTITY_STEPS_PER_FRAME, INSTANCE, PIXELS_OF_FIT, TRAVELS};
 use crate::config::{DensifyRule, TrainConfig};
+use crate::detail::MOST;
 use crate::error::TrainError;
 use crate::trainer::{deformation_shape, memory_of_gaussians, memory_of_planes};
 use crate::working_size;
@@ -115,9 +116,9 @@ pub(super) fn steps_s(
     work: Workload,
     reduction: u32,
 ) -> f64 {
-    let most = f64::from(config.densify.max_gaussians);
+    let most = f64::from(full_set(config, calibration));
     // Densification may start with more than it may add up to.
-    let initial = calibration.initial.min(config.densify.max_gaussians as usize) as f64;
+    let initial = (calibration.initial as f64).min(most);
     let mean = mean_gaussians(config, initial, most);
     let size = calibration.image_size.map(|side| side / reduction);
     let working = working_size::of_size(size, config);
@@ -140,6 +141,15 @@ pub(super) fn steps_s(
     let of_instances =
         f64::from(config.stages.instance) * INSTANCE + IDENTITY_STEPS_PER_FRAME * work.frames as f64;
     coarse + fine + if work.has_instances { of_instances * full } else { 0.0 }
+}
+
+/// Most Gaussians with these settings: more than they say where the images of the capture show much detail.
+fn full_set(config: &TrainConfig, calibration: &Calibration) -> u32 {
+    let most = config.densify.max_gaussians;
+    match config.densify.detail > 0.0 {
+        true => calibration.most.min((MOST * f64::from(most)) as u32).max(most),
+        false => most,
+    }
 }
 
 /// Mean of the Gaussians of the fine stage, which grow by equal factors until their set is full.
@@ -192,10 +202,10 @@ fn memory(
         true => memory_of_planes(&deformation_shape(dataset, config)?).bytes,
         false => 0,
     };
-    let gaussians = u64::from(config.densify.max_gaussians);
+    let gaussians = full_set(config, calibration);
     let [of_pixels, of_gaussians] = BYTES_OF_STEP;
-    let step = of_pixels * pixels(1) + of_gaussians * gaussians;
-    Ok(PROGRAM + frames + planes + memory_of_gaussians(config.densify.max_gaussians).bytes + step)
+    let step = of_pixels * pixels(1) + of_gaussians * u64::from(gaussians);
+    Ok(PROGRAM + frames + planes + memory_of_gaussians(gaussians).bytes + step)
 }
 
 #[cfg(test)]
@@ -257,6 +267,18 @@ mod tests {
         let coarse = steps_s(&config, &MEASURED, still, 1) - seconds - known;
         let step = COARSE * 0.01 * (0.6 + 0.4 * 0.2);
         assert!((coarse / (100.0 * step) - 1.0).abs() < 1e-6, "{coarse}");
+    }
+
+    #[test]
+    fn detail_makes_a_full_set_larger_where_settings_let_it() {
+        let mut config = config();
+        let detailed = Calibration { most: 15_000, ..MEASURED };
+        assert_eq!(full_set(&config, &detailed), 15_000);
+        config.densify.max_gaussians = 6_000;
+        assert_eq!(full_set(&config, &detailed), 12_000, "no more than twice as many");
+        assert_eq!(full_set(&config, &Calibration { most: 5_000, ..MEASURED }), 6_000);
+        config.densify.detail = 0.0;
+        assert_eq!(full_set(&config, &detailed), 6_000);
     }
 
     #[test]

@@ -87,7 +87,6 @@ fn expected(dataset: &Dataset, mut config: TrainConfig, plan: &EffectPlan) -> Re
     let threads = rayon::current_num_threads();
     let calibration =
         calibrate(dataset, &config, &clock, BudgetClock::Wall, threads, MEASURING_S).map_err(Error::plain)?;
-    config.densify.max_gaussians = calibration.most;
     let work = Workload::of(dataset, plan.travelling.len());
     Expected::of(dataset, &config, &calibration, work).map_err(Error::plain)
 }
