@@ -2,7 +2,8 @@
 
 use std::time::Duration;
 
-use cif_render::wgpu::{DeviceSpeed, Gpu};
+use cif_render::Speed;
+use cif_render::wgpu::Gpu;
 use cif_train::wgpu::floors::{StepShape, floor};
 use serde::Serialize;
 
@@ -15,7 +16,7 @@ pub type StageTimes = Vec<(&'static str, Duration)>;
 pub struct OnDevice {
     name: String,
     subgroups: String,
-    speed: DeviceSpeed,
+    speed: Speed,
     stages: Vec<StageRow>,
     /// Mean wall time of a step on the device and on the processor, milliseconds.
     step_ms: [f64; 2],
@@ -78,7 +79,7 @@ impl OnDevice {
     /// # Errors
     /// When the speed of the device cannot be measured.
     pub fn new(gpu: &Gpu, steps: &[StageTimes], shape: &StepShape, step_ms: [f64; 2]) -> Result<Self, Error> {
-        let speed = DeviceSpeed::measure(gpu).map_err(Error::plain)?;
+        let speed = Speed::of_device(gpu).map_err(Error::plain)?;
         Ok(Self {
             name: format!("{} ({})", gpu.facts().name, gpu.facts().interface),
             subgroups: gpu.subgroups().to_string(),
@@ -182,7 +183,7 @@ impl StageRow {
 }
 
 /// Means over steps, by stage, in the order in which stages first ran; those without a floor are left out.
-fn rows(steps: &[StageTimes], shape: &StepShape, speed: &DeviceSpeed) -> Vec<StageRow> {
+fn rows(steps: &[StageTimes], shape: &StepShape, speed: &Speed) -> Vec<StageRow> {
     let mut rows: Vec<StageRow> = Vec::new();
     for (name, time) in steps.iter().flatten() {
         let ms = 1e3 * time.as_secs_f64() / steps.len() as f64;
@@ -214,7 +215,7 @@ mod tests {
             vec![("project", ms(4)), ("accumulate", ms(3))],
         ];
         let shape = StepShape { views: 1.0, gaussians: 1000.0, ..StepShape::default() };
-        let speed = DeviceSpeed { bytes_per_second: 1e8, flops_per_second: 1e9 };
+        let speed = Speed { bytes_per_second: 1e8, flops_per_second: 1e9 };
         let rows = rows(&steps, &shape, &speed);
         assert_eq!(rows.iter().map(|row| row.name).collect::<Vec<_>>(), ["project", "accumulate", "judge"]);
         assert!((rows[0].ms - 3.0).abs() < 1e-9 && (rows[1].ms - 3.0).abs() < 1e-9);
@@ -222,7 +223,7 @@ mod tests {
         assert!((rows[0].floor_ms - 1.2).abs() < 1e-9 && rows[0].floor_by() == "memory");
         assert!((rows[0].share().unwrap() - 0.4).abs() < 1e-9);
         assert_eq!(rows[2].floor_by(), "latency");
-        let slow = DeviceSpeed { flops_per_second: 1e7, ..speed };
+        let slow = Speed { flops_per_second: 1e7, ..speed };
         assert_eq!(super::rows(&steps, &shape, &slow)[0].floor_by(), "arithmetic");
     }
 }

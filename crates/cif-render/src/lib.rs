@@ -5,6 +5,7 @@
 //! | [`blend`] | values per Gaussian in an image: features, logits, codes |
 //! | [`constants`] | thresholds of the blending rule, each with its derivation |
 //! | [`settings`] | what a render may vary |
+//! | [`speed`] | peak throughput of a device or the processor |
 //! | [`gradients`] | where gradients of all parameters are kept |
 //! | [`image`] | what comes out per pixel |
 //! | [`motion`] | how far a Gaussian moves on screen between two views |
@@ -24,6 +25,7 @@ pub mod poses;
 pub mod quality;
 pub mod reference;
 pub mod settings;
+pub mod speed;
 pub mod synthetic;
 #[cfg(feature = "wgpu")]
 pub mod wgpu;
@@ -34,3 +36,4 @@ pub use image::{Channels, InstanceImage, InstanceRanks, RenderedImage, UNLABELLE
 pub use motion::screen_motion;
 pub use poses::PoseGradient;
 pub use settings::{GeometryPath, InstanceNormalisation, InstanceSettings, OccupancySource, RenderSettings};
+pub use speed::Speed;

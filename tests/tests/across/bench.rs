@@ -54,6 +54,9 @@ fn check_parts(report: &Value) {
     let sum: f64 = PARTS.iter().filter(|part| **part != "total").map(|part| mean(part)).sum();
     assert!((sum / mean("total") - 1.0).abs() < 1e-6, "{sum}: {report:#}");
     assert!(PARTS.iter().all(|part| stages[*part]["median_ms"].is_number()));
+    let floor = |part: &str| stages[part]["floor"]["ms"].as_f64();
+    assert!(PARTS[..10].iter().all(|part| floor(part) >= Some(0.0)), "{report:#}");
+    assert!(floor("rasterize") > Some(0.0) && floor("total").is_none(), "{report:#}");
     let units = &report["units"];
     let count = |unit: &str| units[unit]["per_step"].as_f64().unwrap_or_else(|| panic!("{unit}: {report:#}"));
     assert!(count("Gaussians") >= count("visible Gaussians"));

@@ -45,6 +45,7 @@ mod rasterize;
 mod rasterize_backward;
 mod renderer;
 mod rotation;
+mod speed;
 mod tile;
 mod timing;
 

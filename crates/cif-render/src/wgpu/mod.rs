@@ -82,7 +82,6 @@ pub use rasterizer::{
 pub use reflection::{Access, Reflection};
 pub use renderer::GpuRenderer;
 pub use sort::{Count, RadixSort, Scan, SortArrays};
-pub use speed::DeviceSpeed;
 pub use view::{Splat, View};
 
 /// Every structure that Rust and WGSL share.

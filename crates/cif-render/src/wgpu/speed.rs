@@ -1,4 +1,4 @@
-//! Peak throughput of a device, measured: the lower bounds of the times of stages are derived from it.
+//! Peak throughput of a device, measured.
 
 use std::time::{Duration, Instant};
 
@@ -9,6 +9,7 @@ use super::kernel::{
     Commands, Constant, Kernel, MAX_WORKGROUPS, Module, Snippet, Timestamps, constants, workgroups,
 };
 use super::stages::entries;
+use crate::speed::Speed;
 
 /// Rounds of a chain in an invocation.
 const ROUNDS: u32 = 256;
@@ -39,21 +40,12 @@ pub const SPEED: Module = Module {
     entries: &["copy_values", "multiply_add"],
 };
 
-/// Peak throughput of a device.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct DeviceSpeed {
-    /// Bytes read and written per second by a copy.
-    pub bytes_per_second: f64,
-    /// Single-precision operations per second; a fused multiplication and addition counts as two.
-    pub flops_per_second: f64,
-}
-
-impl DeviceSpeed {
+impl Speed {
     /// Measures a device, in well under a second.
     ///
     /// # Errors
     /// When the device is lost, or rejects the kernels.
-    pub fn measure(gpu: &Gpu) -> Result<Self, GpuError> {
+    pub fn of_device(gpu: &Gpu) -> Result<Self, GpuError> {
         let [copy, multiply] = entries(gpu, &SPEED)?;
         let most = COPIED[usize::from(gpu.facts().software)].min(gpu.largest_binding());
         let values = (most / 16) as usize;
@@ -110,7 +102,7 @@ mod tests {
     #[test]
     fn speeds_are_those_of_a_machine() {
         for gpu in testing::gpus() {
-            let DeviceSpeed { bytes_per_second, flops_per_second } = DeviceSpeed::measure(&gpu).unwrap();
+            let Speed { bytes_per_second, flops_per_second } = Speed::of_device(&gpu).unwrap();
             println!("{:.1} GB/s, {:.1} GFLOP/s", bytes_per_second / 1e9, flops_per_second / 1e9);
             // From a busy processor to more than any GPU: finite, and no nonsense.
             assert!((1e7..1e15).contains(&bytes_per_second), "{bytes_per_second}");

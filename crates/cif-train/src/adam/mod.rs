@@ -198,9 +198,11 @@ impl RowRates {
     fn pattern(self) -> [f32; MAX_SPLIT_WIDTH] {
         match self {
             Self::Uniform(rate) => [rate; MAX_SPLIT_WIDTH],
-            Self::Split { base, rest, split, .. } => {
-                std::array::from_fn(|k| if k < split { base } else { rest })
-            }
+            Self::Split { base, rest, split, active } => std::array::from_fn(|k| match k {
+                _ if k >= active => 0.0,
+                _ if k < split => base,
+                _ => rest,
+            }),
         }
     }
 }
@@ -231,9 +233,13 @@ fn step_rows(
                 match rates {
                     RowRates::Uniform(rate) => update(p, g, m, v, rate, bias),
                     RowRates::Split { active, .. } => {
-                        let n = active.min(width);
+                        // Whole vectors: what is left over would go float by float.
+                        let n = active.next_multiple_of(LANES).min(width);
                         let (p, g, m, v) = (&mut p[..n], &g[..n], &mut m[..n], &mut v[..n]);
-                        update_with_rates(p, g, m, v, &pattern[..n], bias);
+                        match active < n {
+                            true => update_with_rates::<true>(p, g, m, v, &pattern[..n], bias),
+                            false => update_with_rates::<false>(p, g, m, v, &pattern[..n], bias),
+                        }
                     }
                 }
             }
@@ -260,6 +266,9 @@ fn all_finite(values: &[f32]) -> bool {
     (lanes.iter().sum::<f32>() + rest) == 0.0
 }
 
+/// Floats of the widest vectors.
+const LANES: usize = 16;
+
 /// The step of one float. Below the smallest normal second moment the ratio would be noise: no step (row 25).
 #[inline(always)]
 fn move_by(p: &mut f32, g: f32, m: &mut f32, v: &mut f32, rate: f32, (second, epsilon): (f32, f32)) {
@@ -284,8 +293,9 @@ fn update(
     }
 }
 
+/// Each float at a rate of its own; where some `STAY`, everything of a float at rate 0 does.
 #[inline(always)]
-fn update_with_rates(
+fn update_with_rates<const STAY: bool>(
     p: &mut [f32],
     g: &[f32],
     m: &mut [f32],
@@ -294,7 +304,11 @@ fn update_with_rates(
     (bias, epsilon): (BiasCorrection, f32),
 ) {
     for ((((p, g), m), v), rate) in p.iter_mut().zip(g).zip(m.iter_mut()).zip(v.iter_mut()).zip(rates) {
+        let before = (*m, *v);
         move_by(p, *g, m, v, rate * bias.first, (bias.second, epsilon));
+        if STAY {
+            (*m, *v) = if *rate > 0.0 { (*m, *v) } else { before };
+        }
     }
 }
 

@@ -95,6 +95,18 @@ fn split_rates_and_inactive_floats() {
         assert!(row[3..12].iter().all(|v| (v + 0.01).abs() < 1e-6));
         assert!(row[12..].iter().all(|v| *v == 0.0));
     }
+    // Moments of what does not move stay as well, whatever its gradients; of 12 floats as of 27 and all 48.
+    let mut alone = Moments::zeros(1, 48);
+    let (mut p, mut g) = ([0.0; 48], [0.5; 48]);
+    for active in [48, 12, 27] {
+        let before = alone.clone();
+        let rates = RowRates::Split { base: 0.1, rest: 0.01, split: 3, active };
+        g.fill(0.5);
+        alone.step(&mut p, &mut g, rates, None).unwrap();
+        let moved = |k: usize| (alone.first[k], alone.second[k]) != (before.first[k], before.second[k]);
+        assert!((0..48).all(|k| moved(k) == (k < active)), "{active}");
+        assert_eq!(g, [0.0; 48]);
+    }
 }
 
 #[test]

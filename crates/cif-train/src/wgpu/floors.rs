@@ -1,5 +1,5 @@
 //! The least that the stages of a step have to move and to compute, from what the step works on: what the time of a
-//! stage on a device is compared with.
+//! stage on a device, or of a part of a step on the processor, is compared with.
 //!
 //! Bytes count every array that a pass reads or writes once, as if caches held everything else; a sort counts its
 //! passes. Operations count additions, multiplications, divisions, roots, exponentials and logarithms as one each, by
@@ -7,7 +7,7 @@
 
 use cif_field::Deformation;
 use cif_field::gaussians::SH_FLOATS;
-use cif_render::wgpu::DeviceSpeed;
+use cif_render::Speed;
 use cif_render::wgpu::deform::{SPLITS, Shape};
 
 /// Workload of a step; sums over its views unless said otherwise.
@@ -81,15 +81,42 @@ pub struct Floor {
 }
 
 impl Floor {
+    /// The floor of a part of a step on the processor by its name, which does what some stages on a device do; `None` for
+    /// parts that have none.
+    #[must_use]
+    pub fn of_part(part: &str, shape: &StepShape) -> Option<Self> {
+        let stages: &[&str] = match part {
+            "bin and sort" => &["sort by depth", "bin", "emit", "sort by tile", "ranges"],
+            "project backward" => &["gather gradients", "project backward"],
+            "deform backward" => {
+                &["deform backward: network", "deform backward: planes", "deform backward: lines"]
+            }
+            "optimiser: network" => return Some(adam(shape.deformation.unwrap_or_default().weights)),
+            "deform"
+            | "project"
+            | "rasterize"
+            | "losses"
+            | "rasterize backward"
+            | "optimiser: Gaussians"
+            | "optimiser: planes" => &[part],
+            _ => return None,
+        };
+        let floors = stages.iter().filter_map(|stage| floor(stage, shape));
+        Some(floors.fold(Self::default(), |sum, of| Self {
+            bytes: sum.bytes + of.bytes,
+            flops: sum.flops + of.flops,
+        }))
+    }
+
     /// Seconds that a device needs at the least.
     #[must_use]
-    pub fn seconds(&self, speed: &DeviceSpeed) -> f64 {
+    pub fn seconds(&self, speed: &Speed) -> f64 {
         (self.bytes / speed.bytes_per_second).max(self.flops / speed.flops_per_second)
     }
 
     /// True when memory, not arithmetic, sets the floor.
     #[must_use]
-    pub fn is_by_memory(&self, speed: &DeviceSpeed) -> bool {
+    pub fn is_by_memory(&self, speed: &Speed) -> bool {
         self.bytes / speed.bytes_per_second >= self.flops / speed.flops_per_second
     }
 }
@@ -186,6 +213,11 @@ pub fn floor(stage: &str, shape: &StepShape) -> Option<Floor> {
     }
 }
 
+/// The floor of Adam for so many parameters.
+fn adam(parameters: f64) -> Floor {
+    Floor { bytes: ADAM_BYTES * parameters, flops: ADAM * parameters }
+}
+
 /// Bytes of nodes that are looked up: four of three planes per feature, or all there are.
 fn looked_up(d: &DeformationShape, views: f64) -> f64 {
     views * (48.0 * d.features * d.moving).min(4.0 * (d.planes + d.lines))
@@ -261,8 +293,24 @@ mod tests {
     }
 
     #[test]
+    fn parts_on_the_processor_do_what_stages_do() {
+        let shape = shape();
+        let stages = ["gather gradients", "project backward"].map(|stage| floor(stage, &shape).unwrap());
+        let part = Floor::of_part("project backward", &shape).unwrap();
+        assert_eq!(part.bytes, stages[0].bytes + stages[1].bytes);
+        assert_eq!(part.flops, stages[0].flops + stages[1].flops);
+        assert_eq!(Floor::of_part("rasterize", &shape), floor("rasterize", &shape));
+        assert_eq!(Floor::of_part("other", &shape), None);
+        let moving = StepShape {
+            deformation: Some(DeformationShape { weights: 10.0, ..Default::default() }),
+            ..shape
+        };
+        assert_eq!(Floor::of_part("optimiser: network", &moving).unwrap().bytes, 320.0);
+    }
+
+    #[test]
     fn the_slower_of_memory_and_arithmetic_is_the_floor() {
-        let speed = DeviceSpeed { bytes_per_second: 100.0, flops_per_second: 1000.0 };
+        let speed = Speed { bytes_per_second: 100.0, flops_per_second: 1000.0 };
         let floor = Floor { bytes: 50.0, flops: 100.0 };
         assert!(floor.is_by_memory(&speed) && (floor.seconds(&speed) - 0.5).abs() < 1e-12);
         let floor = Floor { flops: 2000.0, ..floor };

@@ -16,10 +16,12 @@ use cif_dataset::{Dataset, Layout};
 use cif_field::Field;
 use cif_geometry::stats::{median, median_of_sorted};
 #[cfg(feature = "wgpu")]
+use cif_render::Speed;
+#[cfg(feature = "wgpu")]
 use cif_render::wgpu::Gpu;
 use cif_train::metrics::training_config;
 #[cfg(feature = "wgpu")]
-use cif_train::wgpu::floors::StepShape;
+use cif_train::wgpu::floors::{Floor, StepShape};
 use cif_train::{InstancePass, Stage, StepTimes, Stop, TrainConfig, Trainer};
 use clap::{Args, Subcommand, ValueEnum};
 use serde::Serialize;
@@ -243,7 +245,7 @@ fn measure(
     let mut series = Vec::new();
     let mut simd = String::new();
     #[cfg(feature = "wgpu")]
-    let (gpu, mut device) = (command.backend.open()?, None);
+    let (gpu, mut device, mut floors) = (command.backend.open()?, None, None);
     for table in std::iter::once(None).chain(tables.into_iter().map(Some)) {
         let start = || {
             let (dataset, config, field) = (dataset.clone(), config.clone(), field.clone());
@@ -265,8 +267,12 @@ fn measure(
         }
         let measured = Series::measure(&mut trainer, command)?;
         #[cfg(feature = "wgpu")]
-        if let (Some(gpu), None, Some(_)) = (&gpu, table, trainer.gpu_name()) {
-            device = Some(beside_processor(command, gpu, &trainer, &measured, start)?);
+        match (&gpu, table, trainer.gpu_name()) {
+            (Some(gpu), None, Some(_)) => {
+                device = Some(beside_processor(command, gpu, &trainer, &measured, start)?);
+            }
+            (_, None, None) => floors = Some(Floors::new(command, &trainer.step_shape(&measured.steps))),
+            _ => {}
         }
         series.push(measured);
     }
@@ -277,7 +283,42 @@ fn measure(
         series,
         #[cfg(feature = "wgpu")]
         device,
+        #[cfg(feature = "wgpu")]
+        floors,
     })
+}
+
+/// Least times of the parts of a step on this processor.
+#[cfg(feature = "wgpu")]
+struct Floors {
+    shape: StepShape,
+    speed: Speed,
+}
+
+#[cfg(feature = "wgpu")]
+impl Floors {
+    /// Measures the processor by arrays as large as those of the optimiser.
+    fn new(command: &Step, shape: &StepShape) -> Self {
+        let planes = shape.deformation.map_or(0.0, |deformation| deformation.planes);
+        let bytes = BYTES_OF_GAUSSIAN * shape.gaussians + 16.0 * planes;
+        Self { shape: *shape, speed: Speed::of_processor(command.simd.into(), bytes as usize) }
+    }
+
+    /// Of a part by its name; `None` where it has none.
+    fn of(&self, part: &str) -> Option<LeastTime> {
+        let floor = Floor::of_part(part, &self.shape)?;
+        let by = if floor.is_by_memory(&self.speed) { "memory" } else { "arithmetic" };
+        Some(LeastTime { ms: 1e3 * floor.seconds(&self.speed), by })
+    }
+}
+
+/// Least time of a part of a step.
+#[derive(Clone, Copy, Serialize)]
+struct LeastTime {
+    /// Milliseconds.
+    ms: f64,
+    /// Bound that decides: `memory` or `arithmetic`.
+    by: &'static str,
 }
 
 /// Stages on the device next to their floors, and the same steps on the processor.
@@ -299,6 +340,10 @@ fn beside_processor(
     let wall = |series: &Series| cost(&series.steps, |step| step.total).mean;
     Ok(OnDevice::new(gpu, &measured.device, &shape, [wall(measured), wall(&on_processor)])?)
 }
+
+/// Bytes of a Gaussian in training: 60 values, their gradients and two moments.
+#[cfg(feature = "wgpu")]
+const BYTES_OF_GAUSSIAN: f64 = 4.0 * 4.0 * 60.0;
 
 /// Measured steps with one table of instances.
 struct Series {
@@ -413,6 +458,9 @@ struct Report {
     /// Stages on a GPU.
     #[cfg(feature = "wgpu")]
     device: Option<OnDevice>,
+    /// Least times on the processor; none of steps on a GPU.
+    #[cfg(feature = "wgpu")]
+    floors: Option<Floors>,
 }
 
 /// A count per step, and the time that one of them takes.
@@ -463,6 +511,8 @@ struct PartReport {
     median_ms: f64,
     /// Share of the mean of the whole step, in [0, 1].
     share: Option<f64>,
+    /// Least time that its bytes and operations could take here; null where that is not known.
+    floor: Option<LeastTime>,
 }
 
 /// A count of the work of a step.
@@ -547,12 +597,21 @@ impl Report {
         (seconds > 0.0).then(|| pairs as f64 / seconds / rayon::current_num_threads() as f64)
     }
 
+    /// Least time of a part on the processor.
+    fn floor(&self, part: &str) -> Option<LeastTime> {
+        #[cfg(feature = "wgpu")]
+        return self.floors.as_ref()?.of(part);
+        #[cfg(not(feature = "wgpu"))]
+        return None;
+    }
+
     fn report(&self) -> StepReport<'_> {
         let costs = self.costs();
         let whole = costs.last().map_or(0.0, |(_, cost)| cost.mean);
         let part = |(name, cost): &(&'static str, Cost)| {
             let share = (whole > 0.0).then(|| cost.mean / whole);
-            (*name, PartReport { mean_ms: cost.mean, median_ms: cost.median, share })
+            let floor = self.floor(name);
+            (*name, PartReport { mean_ms: cost.mean, median_ms: cost.median, share, floor })
         };
         let unit = |unit: Unit| {
             (unit.name, UnitReport { per_step: unit.per_step, of: unit.stage, ns_each: unit.ns_each })
@@ -598,17 +657,30 @@ impl Report {
         );
         let costs = self.costs();
         let whole = costs.last().map_or(0.0, |(_, cost)| cost.mean);
-        let mut table = crate::commands::shared::table(["part of a step", "ms", "median ms", "share"]);
+        let heads = ["part of a step", "ms", "median ms", "share", "least ms", "times as long", "by"];
+        let mut table = crate::commands::shared::table(heads);
         for (name, cost) in &costs {
             let share = if whole > 0.0 { 100.0 * cost.mean / whole } else { 0.0 };
+            let floor = self.floor(name);
             table.add_row([
                 (*name).to_owned(),
                 format!("{:.3}", cost.mean),
                 format!("{:.3}", cost.median),
                 format!("{share:.1} %"),
+                floor.map_or(String::new(), |floor| format!("{:.3}", floor.ms)),
+                floor.map_or(String::new(), |floor| format!("{:.1}", cost.mean / floor.ms.max(1e-9))),
+                floor.map_or(String::new(), |floor| floor.by.to_owned()),
             ]);
         }
         println!("{table}\n");
+        #[cfg(feature = "wgpu")]
+        if let Some(Floors { speed, .. }) = &self.floors {
+            println!(
+                "least: every array once at {:.1} GB/s, or every operation at {:.0} GFLOP/s, as measured here\n",
+                speed.bytes_per_second / 1e9,
+                speed.flops_per_second / 1e9
+            );
+        }
         let mut table = crate::commands::shared::table(["work", "per step", "ns each", "of"]);
         // What was not counted, or not done, has no line.
         for unit in self.units().into_iter().filter(|unit| unit.ns_each.is_some()) {
