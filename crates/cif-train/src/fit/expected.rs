@@ -20,12 +20,14 @@ const JOINTS: f64 = 0.5;
 /// Time of all fine steps with the tests of what effects are worth over that without: 1.04 to 1.06 on nine runs.
 const TESTS: f64 = 1.05;
 
-/// Bytes of the program and its libraries.
+/// Bytes of the program and its libraries, and of tables of masks and fits of objects. These and [`BYTES_OF_STEP`] make
+/// the largest memory of eight runs of `draft` 0.81 to 1.2 times what it was.
 const PROGRAM: u64 = 64 << 20;
+const OBJECTS: u64 = 24 << 20;
 
-/// Bytes of a step for each pixel of its image and each Gaussian: images and gradients, pairs of tiles and Gaussians,
-/// projected Gaussians.
-const BYTES_OF_STEP: [u64; 2] = [160, 1_000];
+/// Bytes of a step for each pixel of a whole image and each Gaussian: images, gradients and scores, pairs of tiles and
+/// Gaussians, projected Gaussians.
+const BYTES_OF_STEP: [u64; 2] = [360, 1_000];
 
 /// Facts about a run, besides its settings, that decide its cost and the settings that may change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -126,7 +128,7 @@ pub(super) fn steps_s(
     let (halved, whole) = (costs.first.share, costs.last.share);
     let few = calibration.step_s(initial, reduction * working);
     // These see images of half the size, if any do.
-    let before = 2.0_f64.powi(i32::from(halved > 0.0)) as u32 * reduction * working;
+    let before = if halved > 0.0 { 2 * reduction * working } else { reduction * working };
     let before = calibration.step_before_s(mean, before) - calibration.step_s(mean, before);
     let middle = calibration.step_s(mean, reduction * working);
     let fine = TESTS
@@ -205,7 +207,8 @@ fn memory(
     let gaussians = full_set(config, calibration);
     let [of_pixels, of_gaussians] = BYTES_OF_STEP;
     let step = of_pixels * pixels(1) + of_gaussians * u64::from(gaussians);
-    Ok(PROGRAM + frames + planes + memory_of_gaussians(gaussians).bytes + step)
+    let objects = if work.has_fits(config) { OBJECTS } else { 0 };
+    Ok(PROGRAM + objects + frames + planes + memory_of_gaussians(gaussians).bytes + step)
 }
 
 #[cfg(test)]
