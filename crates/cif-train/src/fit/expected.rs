@@ -82,12 +82,14 @@ pub struct Expected {
     pub fits_s: f64,
     /// Largest memory, bytes.
     pub memory_bytes: u64,
+    /// Most Gaussians: more than the settings say where images show much detail.
+    pub gaussians: u32,
     /// Steps that were measured for it.
     pub measured_steps: usize,
 }
 
 impl Expected {
-    /// What a run with these settings takes, where steps cost what was measured.
+    /// Expects of a run with these settings that its steps cost as much as those that were measured.
     ///
     /// # Errors
     /// When the settings have no deformation, or memory cannot hold it.
@@ -106,6 +108,7 @@ impl Expected {
             steps_s: steps_s(config, calibration, work, 1),
             fits_s: fits * PIXELS_OF_FIT * pixel_s,
             memory_bytes: memory(dataset, config, calibration, work)?,
+            gaussians: full_set(config, calibration),
             measured_steps: calibration.steps,
         })
     }
@@ -315,6 +318,7 @@ mod tests {
         config.motion.parts = true;
         let joints = 7.0 * (JOINTS + 1.0 / TRAVELS);
         assert!((of(&config, others).fits_s / (fit + joints * fit) - 1.0).abs() < 1e-9);
+        assert_eq!(of(&config, WORK).gaussians, 10_000);
         let many = of(&config, Workload { frames: 1_040, ..WORK });
         let more = many.memory_bytes - of(&config, WORK).memory_bytes;
         assert_eq!(more, 1_000 * 20_000 * 5 * 5 / 4, "labels as well, and half the size");

@@ -1,4 +1,4 @@
-//! What a run takes on this machine and this capture, and settings that fit a time budget.
+//! Time and memory of a run on this machine and this capture, and settings that fit a time budget.
 //!
 //! | file | answers |
 //! |---|---|

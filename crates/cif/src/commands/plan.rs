@@ -108,10 +108,11 @@ fn print(plan: &EffectPlan, expected: &Expected) {
         objects => format!(", {} of it fits of {objects} objects", duration(expected.fits_s)),
     };
     println!(
-        "expected: {}{fits}, on {} threads of this machine ({} steps measured); {:.1} GB of memory",
+        "expected: {}{fits}, on {} threads of this machine ({} steps measured); up to {} Gaussians; {:.1} GB of memory",
         duration(expected.steps_s + expected.fits_s),
         rayon::current_num_threads(),
         expected.measured_steps,
+        expected.gaussians,
         expected.memory_bytes as f64 / 1e9
     );
 }
