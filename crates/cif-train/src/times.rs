@@ -81,7 +81,49 @@ impl Work {
     }
 }
 
+/// Shares of a step that grow with pixels, with Gaussians that move, and with neither pixels nor Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StepShares {
+    /// Rasterising and losses.
+    pub pixels: f64,
+    /// Deformation.
+    pub moving: f64,
+    /// Planes and network of the deformation in the optimiser.
+    pub fixed: f64,
+}
+
+impl StepShares {
+    /// From [`StepTimes::seconds_by_growth`]; `None` where there were no steps, or their parts were not timed.
+    #[must_use]
+    pub fn of([pixels, moving, fixed, total]: [f64; 4]) -> Option<Self> {
+        let share = |seconds: f64| (seconds / total).min(1.0);
+        (total > 0.0 && pixels > 0.0).then(|| Self {
+            pixels: share(pixels),
+            moving: share(moving),
+            fixed: share(fixed),
+        })
+    }
+
+    /// Cost of a step with so many times the pixels and Gaussians, and the share of these that moves, relative to those
+    /// that were timed.
+    #[must_use]
+    pub fn cost(&self, pixels: f64, gaussians: f64, moving: f64) -> f64 {
+        let rows = (1.0 - self.pixels - self.moving - self.fixed).max(0.0);
+        self.pixels * pixels + self.fixed + (rows + self.moving * moving) * gaussians
+    }
+}
+
 impl StepTimes {
+    /// Seconds of what grows with pixels, with Gaussians that move, and with neither pixels nor Gaussians, and of all.
+    #[must_use]
+    pub fn seconds_by_growth(&self) -> [f64; 4] {
+        let render = &self.render;
+        let pixels = render.rasterize + render.rasterize_backward + self.losses;
+        let moving = render.deform + render.deform_backward;
+        let fixed = self.optimiser_planes + self.optimiser_mlp;
+        [pixels, moving, fixed, self.total].map(|time| time.as_secs_f64())
+    }
+
     /// Part names and times in the order of a step; they sum to [`Self::total`].
     #[must_use]
     pub fn rows(&self) -> Vec<(&'static str, Duration)> {

@@ -6,9 +6,10 @@ use cif_dataset::{Dataset, Split};
 
 use crate::budget::{Budget, BudgetClock, MOVING};
 use crate::clock::{Clock, Seconds};
-use crate::config::TrainConfig;
+use crate::config::{DensifyRule, TrainConfig};
 use crate::error::TrainError;
 use crate::stage::Stage;
+use crate::times::StepShares;
 use crate::trainer::{InstancePass, Trainer};
 
 /// Training frames that steps are measured on; decoding more would cost more than it tells.
@@ -28,12 +29,8 @@ pub struct Calibration {
     pub gaussians: usize,
     /// Seconds per step, on the clock of the budget.
     pub step_s: f64,
-    /// Share of the step that grows with pixels: rasterising and losses.
-    pub pixel_share: f64,
-    /// Share that grows with neither pixels nor Gaussians: planes and network of the deformation.
-    pub fixed_share: f64,
-    /// Share that grows with the Gaussians that move.
-    pub moving_share: f64,
+    /// Its shares.
+    pub shares: StepShares,
     /// Share of the Gaussians of these steps that moved.
     pub moving: f64,
     /// Width and height of the images.
@@ -57,10 +54,9 @@ impl Calibration {
     }
 
     fn step_with(&self, gaussians: f64, moving: f64, reduction: u32) -> f64 {
-        let rows = (1.0 - self.pixel_share - self.fixed_share - self.moving_share).max(0.0);
-        let pixels = self.pixel_share / f64::from(reduction * reduction);
-        let rows = rows + self.moving_share * moving / self.moving.max(1e-6);
-        self.step_s * (pixels + self.fixed_share + rows * gaussians / self.gaussians.max(1) as f64)
+        let pixels = 1.0 / f64::from(reduction * reduction);
+        let gaussians = gaussians / self.gaussians.max(1) as f64;
+        self.step_s * self.shares.cost(pixels, gaussians, moving / self.moving.max(1e-6))
     }
 }
 
@@ -98,9 +94,14 @@ pub fn calibrate(
     let mut trainer = Trainer::for_measuring(few, config, None, Stage::Fine, 0)?;
     let initial = trainer.field().gaussians.len();
     let moving = if trainer.config().effects.still_every > 0 { MOVING } else { 1.0 };
-    trainer.fill(moving);
+    // By gradients, nobody knows how many there will be.
+    let full = match trainer.config().densify.rule {
+        DensifyRule::Error => trainer.config().densify.max_gaussians as usize,
+        DensifyRule::Gradient => initial,
+    };
+    trainer.fill(full, moving);
     let budget = Budget { seconds: limit_s, clock: on, threads, start: clock.now() };
-    let (mut steps, mut pixel_s, mut fixed_s, mut moving_s, mut total_s) = (0, 0.0, 0.0, 0.0, 0.0);
+    let (mut steps, mut seconds) = (0, [0.0; 4]);
     let mut start = Seconds::default();
     for step in 0..STEPS.0 + STEPS.1 {
         if step == STEPS.0 {
@@ -111,25 +112,20 @@ pub fn calibrate(
             continue;
         }
         steps += 1;
-        let render = &times.render;
-        pixel_s += (render.rasterize + render.rasterize_backward + times.losses).as_secs_f64();
-        fixed_s += (times.optimiser_planes + times.optimiser_mlp).as_secs_f64();
-        moving_s += (render.deform + render.deform_backward).as_secs_f64();
-        total_s += times.total.as_secs_f64();
+        for (sum, seconds) in seconds.iter_mut().zip(times.seconds_by_growth()) {
+            *sum += seconds;
+        }
         if steps >= 3 && budget.used(clock.now()) > limit_s {
             break;
         }
     }
     let spent = Budget { start, ..budget }.used(clock.now());
-    let share = |part: f64| if total_s > 0.0 { part / total_s } else { 0.0 };
     Ok(Calibration {
         initial,
         most: trainer.config().densify.max_gaussians,
         gaussians: trainer.field().gaussians.len(),
         step_s: (spent / f64::from(steps)).max(1e-6),
-        pixel_share: share(pixel_s),
-        fixed_share: share(fixed_s),
-        moving_share: share(moving_s),
+        shares: StepShares::of(seconds).unwrap_or(StepShares { pixels: 0.0, moving: 0.0, fixed: 0.0 }),
         moving,
         image_size,
         steps: steps as usize,

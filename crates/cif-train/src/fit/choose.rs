@@ -166,6 +166,7 @@ fn changes(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::times::StepShares;
 
     const WORK: Workload = Workload {
         is_dynamic: true,
@@ -183,9 +184,7 @@ mod tests {
         most: 20_000,
         gaussians: 20_000,
         step_s: 0.025,
-        pixel_share: 0.3,
-        fixed_share: 0.1,
-        moving_share: 0.3,
+        shares: StepShares { pixels: 0.3, moving: 0.3, fixed: 0.1 },
         moving: 0.4,
         image_size: [256, 192],
         steps: 20,
@@ -214,8 +213,8 @@ mod tests {
     fn images_are_reduced_only_when_there_is_no_other_way() {
         let mut base = TrainConfig::default();
         base.stages.reduction = 1;
-        let shares = Calibration { pixel_share: 0.9, fixed_share: 0.05, moving_share: 0.0, ..MEASURED };
-        let slow = Calibration { step_s: 0.5, image_size: [1352, 1014], ..shares };
+        let shares = StepShares { pixels: 0.9, moving: 0.0, fixed: 0.05 };
+        let slow = Calibration { step_s: 0.5, image_size: [1352, 1014], shares, ..MEASURED };
         let choice = choose(&base, &slow, WORK, 90.0);
         assert!(choice.config.downscale >= Some(2), "{:?}", choice.config.downscale);
         assert!(choice.changes.iter().any(|change| change.setting == "image size"), "{:?}", choice.changes);

@@ -11,17 +11,17 @@ use crate::trainer::{deformation_shape, memory_of_gaussians, memory_of_planes};
 use crate::working_size;
 
 /// Time of one view of those that additions of Gaussians are decided by, in fine steps: it is rendered, and sums over its
-/// pixels go back to the Gaussians.
-const STEPS_OF_VIEW: f64 = 0.7;
+/// pixels go back to the Gaussians. These parts of a step are 0.45 of it on two captures.
+const STEPS_OF_VIEW: f64 = 0.45;
 
-/// Time of looking for joints of an object that does not travel, in fits of one that does: 0.4 to 1 on three captures.
+/// Time of looking for joints of an object that does not travel, in fits of one that does: 0.4 to 1.4 on three captures.
 const JOINTS: f64 = 0.5;
 
-/// Time of all fine steps with the tests of what effects are worth over that without: 1.04 to 1.06 on nine runs.
+/// Time of all fine steps with the tests of what effects are worth over that without: 1.04 to 1.06 on ten runs.
 const TESTS: f64 = 1.05;
 
 /// Bytes of the program and its libraries, and of tables of masks and fits of objects. These and [`BYTES_OF_STEP`] make
-/// the largest memory of eight runs of `draft` 0.81 to 1.2 times what it was.
+/// the largest memory of eight runs of `draft` 0.89 to 1.21 times what it was.
 const PROGRAM: u64 = 64 << 20;
 const OBJECTS: u64 = 24 << 20;
 
@@ -72,7 +72,8 @@ impl Workload {
     }
 }
 
-/// Time and memory that a run is expected to take.
+/// Time and memory that a run is expected to take; at most where Gaussians are added by gradients, as nobody knows how many
+/// there will be.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Expected {
     /// Seconds of the steps of all stages, and of the estimation of identities.
@@ -100,7 +101,7 @@ impl Expected {
         work: Workload,
     ) -> Result<Self, TrainError> {
         let [width, height] = calibration.image_size.map(f64::from);
-        let pixel_s = calibration.pixel_share * calibration.step_s / (width * height).max(1.0);
+        let pixel_s = calibration.shares.pixels * calibration.step_s / (width * height).max(1.0);
         let of_resting = 1.0 / TRAVELS + if config.motion.parts { JOINTS } else { 0.0 };
         let objects = work.travelling as f64 + work.resting as f64 * of_resting;
         let fits = if work.has_fits(config) { objects } else { 0.0 };
@@ -217,6 +218,7 @@ fn memory(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::times::StepShares;
     use crate::trainer::guard_tests::support::{Scene, capture};
 
     /// 10 ms per step with a full set of 10 000, half of it for pixels, a tenth for what moves.
@@ -225,9 +227,7 @@ mod tests {
         most: 10_000,
         gaussians: 10_000,
         step_s: 0.01,
-        pixel_share: 0.5,
-        fixed_share: 0.1,
-        moving_share: 0.1,
+        shares: StepShares { pixels: 0.5, moving: 0.1, fixed: 0.1 },
         moving: 0.25,
         image_size: [200, 100],
         steps: 24,

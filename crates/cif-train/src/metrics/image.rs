@@ -1,19 +1,14 @@
 //! PSNR and SSIM of one picture against its truth. Source: methods reference 9.
 
 use cif_geometry::PixelGrid;
-use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 
 /// Taps of the SSIM window.
 const WINDOW: usize = 11;
 /// Zero padding on each side, so that the SSIM map has the size of the image.
 const PADDING: usize = WINDOW / 2;
-/// Rows of a band. Each band also blurs [`PADDING`] rows above and below along themselves.
+/// Rows of a band; what is blurred along rows is kept of one band at a time.
 const BAND: usize = 32;
-/// Channels of a pixel.
-const CHANNELS: usize = 3;
-/// Moments of two pictures.
-const MOMENTS: usize = 5;
 /// Standard deviation of the SSIM window, pixels.
 const WINDOW_SIGMA: f64 = 1.5;
 /// (0.01 x range)^2 with range 1.
@@ -77,108 +72,64 @@ pub fn masked_psnr(
 #[must_use]
 pub fn ssim(rendered: &PixelGrid<[f32; 3]>, truth: &PixelGrid<[f32; 3]>) -> f64 {
     assert_same_size(rendered, truth);
-    let (x, y) = (rendered.pixels.as_flattened(), truth.pixels.as_flattened());
-    let length = (truth.width as usize).max(1) * CHANNELS;
-    let (taps, level) = (window(), Level::new());
+    let (width, height) = (truth.width as usize, truth.height as usize);
+    let window = window();
     // Sums of bands are added in their order, so that the mean does not depend on the threads.
-    let sums: Vec<f64> = (0..(x.len() / length).div_ceil(BAND))
+    let sums: Vec<f64> = (0..height.div_ceil(BAND))
         .into_par_iter()
-        .map_init(
-            || Maps::new(length),
-            |maps, band| dispatch!(level, _simd => similarity_of_band(maps, (x, y), band * BAND, &taps)),
-        )
-        .collect();
-    sums.iter().sum::<f64>() / x.len() as f64
-}
-
-/// Moments x, y, x^2, y^2 and xy of a band of rows at work; channels of a pixel lie side by side.
-struct Maps {
-    /// A row of each between zeros.
-    padded: [Vec<f64>; MOMENTS],
-    /// The last rows blurred along themselves; a row lies at its index modulo [`WINDOW`].
-    ring: [Vec<f64>; MOMENTS],
-    /// A row blurred both ways.
-    blurred: [Vec<f64>; MOMENTS],
-    /// Values of a row.
-    length: usize,
-}
-
-impl Maps {
-    fn new(length: usize) -> Self {
-        let of = |count: usize| std::array::from_fn(|_| vec![0.0; count]);
-        let padded = of(length + 2 * PADDING * CHANNELS);
-        Self { padded, ring: of(WINDOW * length), blurred: of(length), length }
-    }
-}
-
-/// Sum of the similarities of the rows of a band.
-#[inline(always)]
-fn similarity_of_band(
-    maps: &mut Maps,
-    (x, y): (&[f32], &[f32]),
-    start: usize,
-    taps: &[f64; PADDING + 1],
-) -> f64 {
-    let length = maps.length;
-    let height = x.len() / length;
-    let rows = BAND.min(height - start);
-    let mut sum = 0.0;
-    for around in 0..rows + 2 * PADDING {
-        let place = around % WINDOW * length;
-        match (start + around).checked_sub(PADDING).filter(|row| *row < height) {
-            None => maps.ring.iter_mut().for_each(|ring| ring[place..place + length].fill(0.0)),
-            Some(row) => {
-                let (x, y) = (&x[row * length..][..length], &y[row * length..][..length]);
-                let inner = maps.padded.each_mut().map(|row| &mut row[PADDING * CHANNELS..][..length]);
-                let [mean_x, mean_y, xx, yy, xy] = inner;
-                for k in 0..length {
-                    let (x, y) = (f64::from(x[k].clamp(0.0, 1.0)), f64::from(y[k]));
-                    (mean_x[k], mean_y[k], xx[k], yy[k], xy[k]) = (x, y, x * x, y * y, x * y);
-                }
-                for (padded, ring) in maps.padded.iter().zip(&mut maps.ring) {
-                    let under = std::array::from_fn(|tap| &padded[tap * CHANNELS..][..length]);
-                    blur(&under, taps, &mut ring[place..place + length]);
+        .map(|band| {
+            let rows = band * BAND..height.min((band + 1) * BAND);
+            let around = rows.start.saturating_sub(PADDING)..height.min(rows.end + PADDING);
+            // Moments x, y, x^2, y^2, xy of each of the three channels, blurred along the rows.
+            let mut blurred = vec![[[0.0f64; 5]; 3]; width * around.len()];
+            for (row, out) in around.clone().zip(blurred.chunks_mut(width.max(1))) {
+                let line = row * width..(row + 1) * width;
+                let moments: Vec<[[f64; 5]; 3]> = rendered.pixels[line.clone()]
+                    .iter()
+                    .zip(&truth.pixels[line])
+                    .map(|(x, y)| {
+                        std::array::from_fn(|channel| {
+                            let (x, y) = (f64::from(x[channel].clamp(0.0, 1.0)), f64::from(y[channel]));
+                            [x, y, x * x, y * y, x * y]
+                        })
+                    })
+                    .collect();
+                for (column, sum) in out.iter_mut().enumerate() {
+                    for tap in taps(column, width) {
+                        add_scaled(sum, &moments[column + tap - PADDING], window[tap]);
+                    }
                 }
             }
-        }
-        let Some(first) = around.checked_sub(2 * PADDING) else { continue };
-        for (ring, blurred) in maps.ring.iter().zip(&mut maps.blurred) {
-            let under = std::array::from_fn(|tap| &ring[(first + tap) % WINDOW * length..][..length]);
-            blur(&under, taps, blurred);
-        }
-        sum += similarity_of_row(&mut maps.blurred);
-    }
-    sum
+            let mut similarities = 0.0;
+            for row in rows {
+                let mut line = vec![[[0.0f64; 5]; 3]; width];
+                for tap in taps(row, height) {
+                    let source = (row + tap - PADDING - around.start) * width;
+                    for (sum, value) in line.iter_mut().zip(&blurred[source..source + width]) {
+                        add_scaled(sum, value, window[tap]);
+                    }
+                }
+                similarities += line.iter().flatten().map(similarity).sum::<f64>();
+            }
+            similarities
+        })
+        .collect();
+    sums.iter().sum::<f64>() / (width * height * 3) as f64
 }
 
-/// Weighted sums of what lies under the taps of the window.
-#[inline(always)]
-fn blur(under: &[&[f64]; WINDOW], taps: &[f64; PADDING + 1], out: &mut [f64]) {
-    for (k, out) in out.iter_mut().enumerate() {
-        let mut sum = taps[0] * under[PADDING][k];
-        for distance in 1..=PADDING {
-            sum += taps[distance] * (under[PADDING - distance][k] + under[PADDING + distance][k]);
+/// Window positions that fall inside a line of `length` pixels when centred at `centre`.
+fn taps(centre: usize, length: usize) -> std::ops::Range<usize> {
+    PADDING.saturating_sub(centre)..WINDOW.min(length + PADDING - centre)
+}
+
+fn add_scaled(sum: &mut [[f64; 5]; 3], value: &[[f64; 5]; 3], weight: f64) {
+    for channel in 0..3 {
+        for moment in 0..5 {
+            sum[channel][moment] += weight * value[channel][moment];
         }
-        *out = sum;
     }
 }
 
-/// Sum of the similarities of a row from its blurred moments, of which it replaces the first.
-#[inline(always)]
-fn similarity_of_row([first, mean_y, xx, yy, xy]: &mut [Vec<f64>; MOMENTS]) -> f64 {
-    let moments = first.iter_mut().zip(mean_y).zip(xx).zip(yy).zip(xy);
-    for ((((first, mean_y), xx), yy), xy) in moments {
-        *first = similarity(&[*first, *mean_y, *xx, *yy, *xy]);
-    }
-    let (lanes, rest) = first.as_chunks::<8>();
-    let mut sums = [0.0; 8];
-    for lanes in lanes {
-        sums.iter_mut().zip(lanes).for_each(|(sum, value)| *sum += value);
-    }
-    sums.iter().chain(rest).sum()
-}
-
-#[inline(always)]
 fn similarity(&[mean_x, mean_y, xx, yy, xy]: &[f64; 5]) -> f64 {
     let (variance_x, variance_y) = (xx - mean_x * mean_x, yy - mean_y * mean_y);
     let covariance = xy - mean_x * mean_y;
@@ -186,11 +137,13 @@ fn similarity(&[mean_x, mean_y, xx, yy, xy]: &[f64; 5]) -> f64 {
         / ((mean_x * mean_x + mean_y * mean_y + C1) * (variance_x + variance_y + C2))
 }
 
-/// Normalised taps from the centre outwards.
-fn window() -> [f64; PADDING + 1] {
-    let tap = |offset: usize| (-((offset * offset) as f64) / (2.0 * WINDOW_SIGMA * WINDOW_SIGMA)).exp();
-    let sum = tap(0) + 2.0 * (1..=PADDING).map(tap).sum::<f64>();
-    std::array::from_fn(|offset| tap(offset) / sum)
+fn window() -> [f64; WINDOW] {
+    let raw: [f64; WINDOW] = std::array::from_fn(|tap| {
+        let offset = tap as f64 - PADDING as f64;
+        (-offset * offset / (2.0 * WINDOW_SIGMA * WINDOW_SIGMA)).exp()
+    });
+    let sum: f64 = raw.iter().sum();
+    raw.map(|value| value / sum)
 }
 
 fn assert_same_size(rendered: &PixelGrid<[f32; 3]>, truth: &PixelGrid<[f32; 3]>) {
@@ -276,7 +229,7 @@ mod tests {
                             let at = (r * width + c) as usize;
                             let x = f64::from(rendered.pixels[at][channel]);
                             let y = f64::from(truth.pixels[at][channel]);
-                            let w = g[dy.unsigned_abs() as usize] * g[dx.unsigned_abs() as usize];
+                            let w = g[(dy + 5) as usize] * g[(dx + 5) as usize];
                             for (sum, v) in m.iter_mut().zip([x, y, x * x, y * y, x * y]) {
                                 *sum += w * v;
                             }
@@ -300,8 +253,7 @@ mod tests {
 
     #[test]
     fn window_sums_to_one() {
-        let [centre, outwards @ ..] = window();
-        assert!((centre + 2.0 * outwards.iter().sum::<f64>() - 1.0).abs() < 1e-15);
+        assert!((window().iter().sum::<f64>() - 1.0).abs() < 1e-15);
     }
 
     #[test]

@@ -1,7 +1,5 @@
 //! How long the rest of a run takes, by what its steps and fits took so far.
 
-use std::time::Duration;
-
 use cif_field::Deformation;
 
 use super::Trainer;
@@ -10,51 +8,20 @@ use crate::config::DensifyRule;
 use crate::phase::Phase;
 use crate::schedule::{Due, may_halve};
 use crate::stage::Stage;
-use crate::times::StepTimes;
+use crate::times::{StepShares, StepTimes};
 use crate::working_size::PIXEL_SHARE;
 
 /// Steps of a stage that are looked at for what all of it costs.
 const SAMPLES: u32 = 200;
 
-/// Shares of a step that grow with pixels, with Gaussians that move, and with neither pixels nor Gaussians.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Shares {
-    pixels: f64,
-    moving: f64,
-    fixed: f64,
+/// Shares of the steps between two times.
+fn shares(now: &StepTimes, since: &StepTimes) -> Option<StepShares> {
+    let (now, since) = (now.seconds_by_growth(), since.seconds_by_growth());
+    StepShares::of(std::array::from_fn(|part| now[part] - since[part]))
 }
 
-impl Default for Shares {
-    /// Where parts of steps are not timed, as on GPUs.
-    fn default() -> Self {
-        Self { pixels: PIXEL_SHARE, moving: 0.0, fixed: 0.0 }
-    }
-}
-
-impl Shares {
-    /// Of the steps between two times; `None` where there were none, or their parts were not timed.
-    fn of(now: &StepTimes, since: &StepTimes) -> Option<Self> {
-        let pixels = |of: &StepTimes| of.render.rasterize + of.render.rasterize_backward + of.losses;
-        let moving = |of: &StepTimes| of.render.deform + of.render.deform_backward;
-        let fixed = |of: &StepTimes| of.optimiser_planes + of.optimiser_mlp;
-        let between = |part: fn(&StepTimes) -> Duration| part(now).saturating_sub(part(since)).as_secs_f64();
-        let total = between(|of| of.total);
-        let share = |seconds: f64| (seconds / total).min(1.0);
-        let pixels = between(pixels);
-        (total > 0.0 && pixels > 0.0).then(|| Self {
-            pixels: share(pixels),
-            moving: share(between(moving)),
-            fixed: share(between(fixed)),
-        })
-    }
-
-    /// Cost of a step with so many times the pixels and Gaussians, and the share of these that moves, relative to those
-    /// that were timed.
-    fn cost(&self, pixels: f64, gaussians: f64, moving: f64) -> f64 {
-        let rows = (1.0 - self.pixels - self.moving - self.fixed).max(0.0);
-        self.pixels * pixels + self.fixed + (rows + self.moving * moving) * gaussians
-    }
-}
+/// Where parts of steps are not timed, as on GPUs.
+const UNKNOWN: StepShares = StepShares { pixels: PIXEL_SHARE, moving: 0.0, fixed: 0.0 };
 
 impl Trainer {
     /// Travelling objects that are not fitted yet.
@@ -73,7 +40,7 @@ impl Trainer {
         if let Some(left_s) = self.budget_left_s() {
             return left_s;
         }
-        let shares = Shares::of(&self.state.times, since).unwrap_or_default();
+        let shares = shares(&self.state.times, since).unwrap_or(UNKNOWN);
         let cost = |stage: Stage| match stage {
             Stage::Coarse if self.stages.is_dynamic => COARSE,
             Stage::Instance => INSTANCE,
@@ -165,33 +132,35 @@ impl Trainer {
 
     /// Seconds that the coarse steps took for each pixel of their images; 0 where their parts were not timed.
     fn pixel_s(&self) -> f64 {
-        let StepTimes { render, losses, views, .. } = &self.state.times;
-        let spent = render.rasterize + render.rasterize_backward + *losses;
+        let times = &self.state.times;
+        let [spent_s, ..] = times.seconds_by_growth();
         let camera = &self.state.dataset.frames[self.state.frames.index(0)].camera;
         let pixels =
             f64::from(camera.width) * f64::from(camera.height) * self.pixels_of_step(Stage::Coarse, 1);
-        spent.as_secs_f64() / (pixels * *views as f64).max(1.0)
+        spent_s / (pixels * times.views as f64).max(1.0)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::super::guard_tests::support::{Scene, capture, small_config};
     use super::*;
 
     #[test]
     fn costs_grow_with_what_the_parts_of_steps_grow_with() {
-        let shares = Shares { pixels: 0.5, moving: 0.1, fixed: 0.2 };
-        assert!((shares.cost(1.0, 1.0, 1.0) - 1.0).abs() < 1e-12);
-        assert!((shares.cost(4.0, 2.0, 1.0) - (2.0 + 0.2 + 0.6)).abs() < 1e-12);
-        assert!((shares.cost(1.0, 2.0, 0.5) - (0.5 + 0.2 + 2.0 * (0.2 + 0.05))).abs() < 1e-12);
+        let known = StepShares { pixels: 0.5, moving: 0.1, fixed: 0.2 };
+        assert!((known.cost(1.0, 1.0, 1.0) - 1.0).abs() < 1e-12);
+        assert!((known.cost(4.0, 2.0, 1.0) - (2.0 + 0.2 + 0.6)).abs() < 1e-12);
+        assert!((known.cost(1.0, 2.0, 0.5) - (0.5 + 0.2 + 2.0 * (0.2 + 0.05))).abs() < 1e-12);
         let since = StepTimes { total: Duration::from_secs(1), ..StepTimes::default() };
         let mut now = StepTimes { total: Duration::from_secs(5), ..since };
-        assert_eq!(Shares::of(&now, &since), None, "parts are not timed");
+        assert_eq!(shares(&now, &since), None, "parts are not timed");
         (now.losses, now.optimiser_mlp) = (Duration::from_secs(1), Duration::from_secs(2));
         now.render.deform = Duration::from_millis(500);
-        assert_eq!(Shares::of(&now, &since), Some(Shares { pixels: 0.25, moving: 0.125, fixed: 0.5 }));
-        assert_eq!(Shares::of(&since, &since), None);
+        assert_eq!(shares(&now, &since), Some(StepShares { pixels: 0.25, moving: 0.125, fixed: 0.5 }));
+        assert_eq!(shares(&since, &since), None);
     }
 
     #[test]
@@ -238,7 +207,7 @@ mod tests {
         assert_eq!(trainer.gaussians_at(Stage::Fine, 90), now, "nobody knows");
         // A step on half-size images takes a second; parts are not timed.
         let eta_s = trainer.eta_s(Stage::Fine, 1.0, &StepTimes::default());
-        let cost = |pixels: f64| Shares::default().cost(4.0 * pixels, 1.0, 1.0);
+        let cost = |pixels: f64| UNKNOWN.cost(4.0 * pixels, 1.0, 1.0);
         let identity = IDENTITY_STEPS_PER_FRAME * trainer.frames_of_identities(Stage::Fine) as f64;
         let expected = 40.0 + (40.0 + identity) * cost(1.0) + 20.0 * cost(4.0);
         assert!((eta_s / expected - 1.0).abs() < 1e-6, "{eta_s} {expected}");
@@ -246,7 +215,7 @@ mod tests {
         trainer.state.progress.iteration = 80;
         let eta_s = trainer.eta_s(Stage::Fine, 2.0, &StepTimes::default());
         assert!(
-            (eta_s / (10.0 * Shares::default().cost(4.0, 1.0, 1.0) + 0.5 * identity) - 1.0).abs() < 1e-6,
+            (eta_s / (10.0 * UNKNOWN.cost(4.0, 1.0, 1.0) + 0.5 * identity) - 1.0).abs() < 1e-6,
             "{eta_s}"
         );
         // Before it is known what stands still, fewer will move behind the first test.

@@ -97,14 +97,13 @@ impl Trainer {
         result.map(|_| self.times())
     }
 
-    /// Splits Gaussians, as densification does, until the set is full, and lets all but a share of them stand still: steps
-    /// like those that most of the fine stage consists of.
+    /// Splits Gaussians, as densification does, until there are so many, and lets all but a share of them stand still:
+    /// steps like those that most of the fine stage consists of.
     ///
     /// # Panics
     /// When the share is not in [0, 1].
-    pub fn fill(&mut self, moving: f64) {
+    pub fn fill(&mut self, most: usize, moving: f64) {
         assert!((0.0..=1.0).contains(&moving), "{moving} of the Gaussians cannot move");
-        let most = self.state.config.densify.max_gaussians as usize;
         let mut rng = stream(self.state.config.seed, Purpose::Split, 0);
         loop {
             let count = self.state.field.gaussians.len();
@@ -219,8 +218,7 @@ mod tests {
         let mut trainer = Trainer::for_measuring(dataset, small_config(), None, Stage::Fine, 0).unwrap();
         let initial = trainer.field().gaussians.len();
         let most = 5 * initial + 3;
-        trainer.state.config.densify.max_gaussians = most as u32;
-        trainer.fill(0.3);
+        trainer.fill(most, 0.3);
         let moving = |trainer: &Trainer| {
             let field = trainer.field();
             field.deformation.as_ref().unwrap().moving_rows(field.gaussians.len()).count()
@@ -229,7 +227,7 @@ mod tests {
         assert_eq!(moving(&trainer), (0.3 * most as f64).floor() as usize);
         trainer.measure_step(InstancePass::Off).unwrap();
         // A set that is full already stays.
-        trainer.fill(1.0);
+        trainer.fill(most, 1.0);
         assert_eq!((trainer.field().gaussians.len(), moving(&trainer)), (most, most));
     }
 

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use cif_dataset::Dataset;
 use cif_train::budget::BudgetClock;
+use cif_train::config::DensifyRule;
 use cif_train::fit::{Expected, Workload, calibrate};
 use cif_train::{Clock, EffectChoice, EffectPlan, Stop, SystemClock, TrainConfig};
 use clap::Args;
@@ -75,9 +76,10 @@ pub(super) fn run(command: &Plan) -> Result<(), Error> {
     }
     print_warnings(&dataset);
     let plan = EffectPlan::new(&dataset, &config, &command.effects).map_err(Error::plain)?;
+    let is_bound = config.densify.rule == DensifyRule::Gradient;
     let expected = expected(&dataset, config, &plan)?;
     let report = || PlanReport { plan: plan.clone(), expected, threads: rayon::current_num_threads() };
-    command.report.give(report, || print(&plan, &expected))
+    command.report.give(report, || print(&plan, &expected, is_bound))
 }
 
 /// Time and memory of a run on this machine, by steps that are measured.
@@ -91,7 +93,7 @@ fn expected(dataset: &Dataset, mut config: TrainConfig, plan: &EffectPlan) -> Re
     Expected::of(dataset, &config, &calibration, work).map_err(Error::plain)
 }
 
-fn print(plan: &EffectPlan, expected: &Expected) {
+fn print(plan: &EffectPlan, expected: &Expected, is_bound: bool) {
     let mut table = crate::commands::shared::table(["effect", "decision", "evidence", "cost", "otherwise"]);
     for effect in &plan.effects {
         table.add_row([
@@ -105,12 +107,17 @@ fn print(plan: &EffectPlan, expected: &Expected) {
     println!("{table}");
     let fits = match plan.travelling.len() {
         _ if expected.fits_s <= 0.0 => String::new(),
+        1 => format!(", {} of it fits of 1 object", duration(expected.fits_s)),
         objects => format!(", {} of it fits of {objects} objects", duration(expected.fits_s)),
     };
+    let threads = match rayon::current_num_threads() {
+        1 => "1 thread".to_owned(),
+        threads => format!("{threads} threads"),
+    };
     println!(
-        "expected: {}{fits}, on {} threads of this machine ({} steps measured); up to {} Gaussians; {:.1} GB of memory",
+        "expected: {}{}{fits}, on {threads} of this machine ({} steps measured); up to {} Gaussians; {:.1} GB of memory",
+        if is_bound { "at most " } else { "" },
         duration(expected.steps_s + expected.fits_s),
-        rayon::current_num_threads(),
         expected.measured_steps,
         expected.gaussians,
         expected.memory_bytes as f64 / 1e9

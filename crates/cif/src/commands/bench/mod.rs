@@ -598,11 +598,14 @@ impl Report {
     }
 
     /// Least time of a part on the processor.
+    #[cfg(feature = "wgpu")]
     fn floor(&self, part: &str) -> Option<LeastTime> {
-        #[cfg(feature = "wgpu")]
-        return self.floors.as_ref()?.of(part);
-        #[cfg(not(feature = "wgpu"))]
-        return None;
+        self.floors.as_ref()?.of(part)
+    }
+
+    #[cfg(not(feature = "wgpu"))]
+    fn floor(&self, _: &str) -> Option<LeastTime> {
+        None
     }
 
     fn report(&self) -> StepReport<'_> {
