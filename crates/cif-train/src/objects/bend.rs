@@ -128,11 +128,13 @@ fn refitted(
     sum / judged.iter().map(weight).sum::<f64>().max(1e-12)
 }
 
-/// Error of an object that may bend, of that of one that may not, on views that were left out.
+/// Error of an object that may bend, on views that were left out.
 pub(super) fn bent(fit: &Fit<'_>, views: (&[usize], &[usize]), level: usize) -> f64 {
-    let (rigid, bent) = rayon::join(
-        || refitted(fit, None, views, level),
-        || refitted(fit, Some(Bend::none(fit)), views, level),
-    );
+    refitted(fit, Some(Bend::none(fit)), views, level)
+}
+
+/// The same, of that of one that may not.
+pub(super) fn gain(fit: &Fit<'_>, views: (&[usize], &[usize]), level: usize) -> f64 {
+    let (rigid, bent) = rayon::join(|| refitted(fit, None, views, level), || bent(fit, views, level));
     bent / rigid.max(1e-12)
 }

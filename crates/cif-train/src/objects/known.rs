@@ -51,6 +51,12 @@ impl KnownObjects {
         self.moving(label).is_some() || self.jointed(label).is_some()
     }
 
+    /// Keeps that an object rests but for a part that turns in place.
+    pub(crate) fn insert_turning(&mut self, label: u16, part: Jointed) {
+        self.rigid.insert(label, Found::Nothing);
+        self.parts.insert(label, Some(part));
+    }
+
     /// Number of objects that move as a whole.
     pub(crate) fn moving_count(&self) -> usize {
         self.rigid.values().filter(|found| matches!(found, Found::Moves(_))).count()

@@ -19,12 +19,14 @@
 //! | `bend` | whether it rather deforms |
 //! | `start` | everything in order |
 //! | `rotation` | whether the pictures show how it turns |
+//! | `discs` | whether it is a ball on a stand |
 //! | `parts` | which part of it turns on a hinge or slides |
 //! | `known` | what was found of all objects, saved with the run |
 
 mod ball;
 mod below;
 mod bend;
+mod discs;
 mod fit;
 mod follow;
 mod grow;
@@ -113,13 +115,16 @@ pub(crate) fn up(dataset: &Dataset) -> DVec3 {
 pub(crate) enum Found {
     /// Its motion as a whole.
     Moves(Box<Fitted>),
+    /// It rests, but for a part that turns in place.
+    Turns(Box<Jointed>),
     /// It rests, or its masks do not tell enough.
     Nothing,
     /// Nothing tells how far away it is: one camera sees it, from one side, and no support is known.
     Nowhere,
 }
 
-/// Fits one object (a label: dense index + 1); one that rests is fitted only where it is told to be rigid.
+/// Fits one object (a label: dense index + 1); one that rests is fitted only where it is told to be rigid, or where it is
+/// a ball on a stand that turns.
 ///
 /// # Errors
 /// When a frame cannot be read, or the run is to stop, or is out of time for this.
@@ -136,6 +141,9 @@ pub(crate) fn fit(
         return Ok(if views.is_empty() { Found::Nothing } else { Found::Nowhere });
     }
     let objects = Object::by_outlines(label, &views, &outlines, is_told, surroundings);
+    if !is_told && let Some(found) = parts::turning_ball(objects[0])? {
+        return Ok(Found::Turns(Box::new(found)));
+    }
     let fitted = start::fit_object(&objects)?;
     surroundings.phases.check()?;
     Ok(fitted.map_or(Found::Nothing, |fitted| Found::Moves(Box::new(fitted))))

@@ -3,12 +3,13 @@
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
 
+use cif_geometry::PinholeCamera;
 use glam::{DMat2, DVec2, DVec3};
 
 use super::path;
 use super::plane::Plane;
 use super::view::{ObjectView, WITHIN, are_discs, is_one_camera, median, rests};
-use crate::tracks::nearest_to_rays;
+use crate::tracks::{across, nearest_to_rays};
 
 /// Largest apparent size of a mask, relative to that on the plane, at which its object is taken to touch the plane.
 const AIR: f64 = 1.1;
@@ -120,20 +121,25 @@ struct Reading {
 /// The point nearest to rays through the middles of masks, by weights; `None` where they are parallel. Of several rays,
 /// those that miss the point where most others meet count less: masks that show more than the object, or another.
 pub(super) fn meeting_point<'a>(views: impl Iterator<Item = (&'a ObjectView, f64)>) -> Option<DVec3> {
-    let views: Vec<(&ObjectView, f64)> = views.collect();
+    meeting_of_rays(&views.map(|(view, weight)| (&view.camera, view.centroid, weight)).collect::<Vec<_>>())
+}
+
+/// The same of rays through pixels of cameras, by weights.
+pub(super) fn meeting_of_rays(rays: &[(&PinholeCamera, DVec2, f64)]) -> Option<DVec3> {
     let nearest = |shares: &[(usize, f64)]| {
-        let rays =
-            shares.iter().map(|(k, share)| (&views[*k].0.camera, views[*k].0.centroid, views[*k].1 * share));
-        nearest_to_rays(rays, PARALLEL)
+        let shared = shares.iter().map(|(k, share)| (rays[*k].0, rays[*k].1, rays[*k].2 * share));
+        nearest_to_rays(shared, PARALLEL)
     };
-    let all: Vec<(usize, f64)> = (0..views.len()).map(|k| (k, 1.0)).collect();
-    if views.len() < FEWEST_RAYS {
+    let all: Vec<(usize, f64)> = (0..rays.len()).map(|k| (k, 1.0)).collect();
+    if rays.len() < FEWEST_RAYS {
         return nearest(&all);
     }
-    let distances =
-        |point: DVec3| -> Vec<f64> { views.iter().map(|(view, _)| view.distance(point)).collect() };
+    let distance = |(camera, pixel, _): &(&PinholeCamera, DVec2, f64), point: DVec3| {
+        (across(camera, *pixel) * (point - camera.centre())).length()
+    };
+    let distances = |point: DVec3| -> Vec<f64> { rays.iter().map(|ray| distance(ray, point)).collect() };
     // Of the points where two rays meet, and that where all do, the one that is nearest to the middle ray.
-    let paired: Vec<usize> = (0..views.len()).step_by(views.len().div_ceil(MOST_PAIRED)).collect();
+    let paired: Vec<usize> = (0..rays.len()).step_by(rays.len().div_ceil(MOST_PAIRED)).collect();
     let pairs = (0..paired.len()).flat_map(|a| (0..a).map(move |b| (a, b)));
     let pairs = pairs.map(|(a, b)| vec![(paired[a], 1.0), (paired[b], 1.0)]);
     let points = pairs.chain([all]).filter_map(|rays| nearest(&rays));

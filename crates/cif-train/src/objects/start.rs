@@ -11,6 +11,7 @@ use rand_pcg::Pcg64;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::bend;
 use super::fit::{Fit, Turns, hull};
 use super::follow::follow;
 use super::grow::grow;
@@ -355,7 +356,8 @@ impl<'a> Object<'a> {
         let all: Vec<usize> = self.views_at(&path).collect();
         follow(&mut fit, reference, &path, &all, self.surroundings.phases)?;
         let error = fit.mean_loss(&all, 0);
-        if !self.is_told && self.at_rest(&all).is_some_and(|rests| rests <= trials::REST_GAIN[1] * error) {
+        let stays = |bent: f64| bent <= trials::BENDS_IN_PLACE * error;
+        if !self.is_told && self.bent_in_place(&all).is_some_and(stays) {
             return Ok(None);
         }
         let rotation = if self.shows(&path, &fit.poses) {
@@ -386,8 +388,8 @@ impl<'a> Object<'a> {
         meeting_point(views.iter().map(|k| (&self.views[*k], self.views[*k].visible.powi(2))))
     }
 
-    /// Error of the object in one place, on the views that it is fitted to.
-    fn at_rest(&self, views: &[usize]) -> Option<f64> {
+    /// Error of the object bending in one place, on the views that it is fitted to.
+    fn bent_in_place(&self, views: &[usize]) -> Option<f64> {
         let rests = Pose { rotation: DQuat::IDENTITY, translation: self.resting_place(views)? };
         let poses = views.iter().map(|k| (self.views[*k].time_index, rests)).collect();
         let shape = self.hull(&poses, FOLLOWED, &mut self.rng())?;
@@ -395,7 +397,7 @@ impl<'a> Object<'a> {
         fit.turns = Turns::Given;
         fit.stays = true;
         fit.steps(views, STEPS[1], |share| (if share < 0.5 { 1.0 } else { 0.5 }, 0.0, 0));
-        Some(fit.mean_loss(views, 0))
+        Some(bend::bent(&fit, (views, views), 0))
     }
 }
 

@@ -259,9 +259,9 @@ pub(super) fn rests(views: &[ObjectView], time: usize) -> bool {
 }
 
 /// True with one view at most of every time.
-pub(super) fn is_one_camera(views: &[ObjectView]) -> bool {
+pub(super) fn is_one_camera<'a>(views: impl IntoIterator<Item = &'a ObjectView>) -> bool {
     let mut seen = BTreeSet::new();
-    views.iter().all(|view| seen.insert(view.time_index))
+    views.into_iter().all(|view| seen.insert(view.time_index))
 }
 
 /// True where whole masks are discs, as those of balls.

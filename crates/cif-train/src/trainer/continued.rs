@@ -1,5 +1,5 @@
 //! Poses at times of the capture that no training frame shows: before the first and after the last of them, as where
-//! every eighth frame is held out.
+//! every eighth frame is held out, and before an object comes into the images or after it has left them.
 
 use cif_dataset::{Dataset, Split};
 use cif_field::Tracks;
@@ -10,14 +10,12 @@ use glam::DQuat;
 use super::Trainer;
 use crate::poses::PoseMoments;
 
-/// Times that training frames show, and those outside that a capture has.
+/// Times that training frames show.
 struct Span {
     first: f64,
     last: f64,
-    /// The longest time between two training frames: so far motion is taken to go on.
+    /// The longest time between two of them: so far motion is taken to go on outside.
     reach: f64,
-    before: Vec<f64>,
-    after: Vec<f64>,
 }
 
 impl Span {
@@ -28,20 +26,11 @@ impl Span {
         times.sort_by(f64::total_cmp);
         let reach = times.windows(2).map(|pair| pair[1] - pair[0]).fold(0.0, f64::max);
         let (first, last) = (*times.first()?, *times.last()?);
-        let outside = |is_outside: &dyn Fn(f64) -> bool| {
-            dataset.times.iter().copied().filter(|time| is_outside(*time)).collect()
-        };
-        (reach > 0.0).then(|| Self {
-            first,
-            last,
-            reach,
-            before: outside(&|time| time < first),
-            after: outside(&|time| time > last),
-        })
+        (reach > 0.0).then_some(Self { first, last, reach })
     }
 
-    fn has(&self, pose: &TrackPose) -> bool {
-        (self.first..=self.last).contains(&pose.time)
+    fn has(&self, time: f64) -> bool {
+        (self.first..=self.last).contains(&time)
     }
 }
 
@@ -70,23 +59,45 @@ fn continued(poses: &[TrackPose], time: f64, reach: f64) -> Option<TrackPose> {
     })
 }
 
-/// Gives groups that the first or the last training frame shows poses at the times outside; those that were there are
-/// found anew. True where poses have changed.
-fn continue_tracks(tracks: &mut Tracks, moments: &mut PoseMoments, span: &Span) -> bool {
+/// Gives groups that move poses at the times of `times` before and behind those that are trained: outside the span of the
+/// training frames, and inside it as long as nothing is in view at the place where they would be then. Those that were
+/// there are found anew. True where poses have changed.
+fn continue_tracks(
+    tracks: &mut Tracks,
+    moments: &mut PoseMoments,
+    (span, times): (&Span, &[f64]),
+    is_in_view: impl Fn(&TrackPose) -> bool,
+) -> bool {
     let mut place = 0;
     let mut changed = false;
     for group in &mut tracks.groups {
-        let count = group.poses.len();
-        let seen: Vec<TrackPose> = group.poses.iter().copied().filter(|pose| span.has(pose)).collect();
-        let held_before = group.poses.iter().take_while(|pose| pose.time < span.first).count();
-        let of = |times: &[f64]| -> Vec<TrackPose> {
-            times.iter().filter_map(|time| continued(&seen, *time, span.reach)).collect()
+        let places = place..place + group.poses.len();
+        let is_trained = |k: &usize| moments.shares[*k] > 0.0;
+        let first = places.clone().find(is_trained).unwrap_or(places.start);
+        let last = places.clone().rfind(is_trained).map_or(places.end, |last| last + 1);
+        let seen = group.poses[first - place..last - place].to_vec();
+        // Its part would leave the joint.
+        let may_leave = group.joint.is_none();
+        let going_on = |times: &mut dyn Iterator<Item = f64>| -> Vec<TrackPose> {
+            let mut poses = Vec::new();
+            for time in times {
+                let is_outside = !span.has(time);
+                let reach = if is_outside { span.reach } else { f64::INFINITY };
+                let Some(pose) = continued(&seen, time, reach) else { break };
+                if !is_outside && (!may_leave || is_in_view(&pose)) {
+                    break;
+                }
+                poses.push(pose);
+            }
+            poses
         };
-        let is_at = |pose: Option<&TrackPose>, time: f64| pose.is_some_and(|pose| pose.time == time);
-        let before = if is_at(seen.first(), span.first) { of(&span.before) } else { Vec::new() };
-        let after = if is_at(seen.last(), span.last) { of(&span.after) } else { Vec::new() };
-        let trained = place + held_before..place + held_before + seen.len();
-        moments.replace(place..place + count, trained, [before.len(), after.len()]);
+        let (mut before, mut after) = (Vec::new(), Vec::new());
+        if let Some((from, to)) = seen.first().zip(seen.last()) {
+            before = going_on(&mut times.iter().rev().copied().filter(|time| *time < from.time));
+            before.reverse();
+            after = going_on(&mut times.iter().copied().filter(|time| *time > to.time));
+        }
+        moments.replace(places, first..last, [before.len(), after.len()]);
         let poses = [before, seen, after].concat();
         place += poses.len();
         changed |= poses != group.poses;
@@ -96,12 +107,18 @@ fn continue_tracks(tracks: &mut Tracks, moments: &mut PoseMoments, span: &Span) 
 }
 
 impl Trainer {
-    /// Continues the motion of objects to the times of the capture before the first and after the last training frame.
+    /// Continues the motion of objects to the times of the capture at which no training frame shows them.
     pub(super) fn continue_poses(&mut self) {
-        let Some(span) = Span::of(&self.state.dataset) else { return };
         let state = &mut self.state;
+        let Some(span) = Span::of(&state.dataset) else { return };
         let Some(tracks) = &mut state.field.tracks else { return };
-        if continue_tracks(tracks, &mut state.pose_moments, &span) {
+        let (frames, times) = (&state.dataset.frames, &state.dataset.times);
+        let is_in_view = |pose: &TrackPose| {
+            let mut then =
+                frames.iter().filter(|frame| frame.split == Split::Train && frame.time == pose.time);
+            then.any(|frame| frame.camera.pixel_of(pose.translation).is_some())
+        };
+        if continue_tracks(tracks, &mut state.pose_moments, (&span, times), is_in_view) {
             state.gradients = Gradients::zeros(&state.field);
         }
     }
@@ -118,11 +135,8 @@ mod tests {
     use crate::events::{Control, Outcome};
     use crate::stage::Stage;
 
-    const SPAN: Span = Span { first: 0.2, last: 0.8, reach: 0.2, before: Vec::new(), after: Vec::new() };
-
-    fn span() -> Span {
-        Span { before: vec![0.0, 0.1], after: vec![0.9], ..SPAN }
-    }
+    const SPAN: Span = Span { first: 0.2, last: 0.8, reach: 0.2 };
+    const TIMES: [f64; 6] = [0.0, 0.1, 0.2, 0.5, 0.8, 0.9];
 
     /// A group that moves at a speed and turns around z, with keys at some times.
     fn moving(times: &[f64]) -> TrackGroup {
@@ -164,16 +178,37 @@ mod tests {
         assert_eq!((pose.translation, pose.rotation), (DVec3::splat(0.7), DQuat::IDENTITY));
     }
 
+    fn go_on(tracks: &mut Tracks, moments: &mut PoseMoments) -> bool {
+        continue_tracks(tracks, moments, (&SPAN, &TIMES), |_| true)
+    }
+
+    #[test]
+    fn what_comes_into_the_images_later_was_on_its_way_before() {
+        let mut tracks = Tracks { groups: vec![moving(&[0.5, 0.6, 0.7, 0.8])], ..Tracks::default() };
+        let mut moments = PoseMoments::zeros(Some(&tracks));
+        let times = [0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
+        let is_in_view = |pose: &TrackPose| pose.translation.x < 0.5;
+        for _ in 0..2 {
+            continue_tracks(&mut tracks, &mut moments, (&SPAN, &times), is_in_view);
+            let places: Vec<(f64, f64)> =
+                tracks.groups[0].poses.iter().map(|pose| (pose.time, pose.translation.x)).collect();
+            // At 0.2 it would be in view, but nothing is seen of it.
+            assert_eq!(places.iter().map(|(time, _)| *time).collect::<Vec<_>>(), times[1..]);
+            assert!(places.iter().all(|(time, x)| (x - 2.0 * time).abs() < 1e-9), "{places:?}");
+        }
+        assert_eq!(moments.shares, [0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0]);
+    }
+
     #[test]
     fn moments_follow_their_poses_and_a_second_time_changes_nothing() {
-        // Of the second, the first training frame shows nothing: it is not known to have been there.
+        // Of the second, the first training frame shows nothing, though it would: it is not known to have been there.
         let groups = vec![moving(&[0.2, 0.5, 0.8]), moving(&[0.5, 0.8]), TrackGroup::still("b", DVec3::ZERO)];
         let mut tracks = Tracks { groups, ..Tracks::default() };
         let mut moments = PoseMoments::zeros(Some(&tracks));
         for (k, steps) in moments.steps.iter_mut().enumerate() {
             *steps = 10 + k as u32;
         }
-        assert!(continue_tracks(&mut tracks, &mut moments, &span()));
+        assert!(go_on(&mut tracks, &mut moments));
         let times =
             |group: usize| tracks.groups[group].poses.iter().map(|pose| pose.time).collect::<Vec<_>>();
         assert_eq!(times(0), [0.0, 0.1, 0.2, 0.5, 0.8, 0.9]);
@@ -182,11 +217,11 @@ mod tests {
         assert_eq!(moments.steps, [0, 0, 10, 11, 12, 0, 13, 14, 0]);
         assert_eq!(moments.shares, [0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 0.0]);
         let (before, kept) = (tracks.clone(), moments.clone());
-        assert!(!continue_tracks(&mut tracks, &mut moments, &span()));
+        assert!(!go_on(&mut tracks, &mut moments));
         assert!(tracks == before && moments == kept);
         // Poses that were trained on take those outside with them.
         tracks.groups[0].poses[2].translation.y = 1.0;
-        assert!(continue_tracks(&mut tracks, &mut moments, &span()));
+        assert!(go_on(&mut tracks, &mut moments));
         assert!(tracks.groups[0].poses[1].translation.y > 1.0 && moments == kept);
     }
 

@@ -92,7 +92,7 @@ impl Trainer {
         let plane = self.support()?;
         let left_out = self.fit_objects(Phase::Search, &others, plane.as_ref())?;
         for label in &others {
-            if self.state.objects.moving(*label).is_some() {
+            if self.state.objects.has_poses(*label) {
                 self.state.guidance.travelling[usize::from(*label)] = true;
             }
         }
@@ -254,6 +254,7 @@ impl Trainer {
         let (mut left_out, mut failed) = (Vec::new(), None);
         for (label, found) in labels.iter().zip(found) {
             match found {
+                Ok(Some(Found::Turns(part))) => self.state.objects.insert_turning(*label, *part),
                 Ok(Some(found)) => drop(self.state.objects.rigid.insert(*label, found)),
                 Ok(None) => left_out.push(*label),
                 Err(error) => failed = failed.or(Some(error)),

@@ -7,7 +7,7 @@ use cif_field::tracks::JointKind;
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
-use super::super::shape::Pose;
+use super::super::shape::{Pose, Shape};
 use super::body::{Body, Hinge, between, range};
 use super::guesses::Guess;
 use super::promise::LOOKS;
@@ -54,23 +54,36 @@ impl<'a> Search<'a> {
         level: usize,
     ) -> Option<Fit<'a>> {
         let hinge = guess.hinge;
-        let posed = self.base.iter().map(|(time, pose)| (*time, hinge.posed(pose, between(values, *time))));
-        let posed: BTreeMap<usize, Pose> = posed.collect();
         let mut base = self.hull(self.base, None, of_base)?;
         base.fade(FAINT, |place| guess.has(place, 0.0));
         let margin = 0.1 * self.size;
         let inside = |place: DVec3| guess.has(place, margin);
-        let mut part = self.hull(&posed, Some(&inside), of_part)?;
+        let mut part = self.hull(&self.posed(hinge, values), Some(&inside), of_part)?;
         part.fade(FAINT, |place| !guess.has(place, 0.0));
-        let members: Vec<bool> = (0..base.gaussians().len() + part.gaussians().len())
-            .map(|row| row >= base.gaussians().len())
-            .collect();
-        let times = self.times(usize::MAX);
-        let values = times.keys().map(|time| (*time, between(values, *time))).collect();
-        let mut body = self.body(base.joined(&part), Some((hinge, members, values)));
+        let mut body = self.together((base, &part), hinge, values);
         body.steps(&self.train, steps, level, |share| if share < 0.2 { (1.0, 0.0) } else { (1.0, 1.0) });
         let loss = body.mean_loss(&self.train, level);
         Some(Fit { guess, body, loss })
+    }
+
+    /// World from a part by time, with values of its joint.
+    pub(super) fn posed(&self, hinge: Hinge, values: &BTreeMap<usize, f64>) -> BTreeMap<usize, Pose> {
+        let posed = |(time, pose): (&usize, &Pose)| (*time, hinge.posed(pose, between(values, *time)));
+        self.base.iter().map(posed).collect()
+    }
+
+    /// A base and a part on a joint.
+    pub(super) fn together(
+        &self,
+        (base, part): (Shape, &Shape),
+        hinge: Hinge,
+        values: &BTreeMap<usize, f64>,
+    ) -> Body<'a> {
+        let of_base = base.gaussians().len();
+        let members = (0..of_base + part.gaussians().len()).map(|row| row >= of_base).collect();
+        let times = self.times(usize::MAX);
+        let values = times.keys().map(|time| (*time, between(values, *time))).collect();
+        self.body(base.joined(part), Some((hinge, members, values)))
     }
 
     /// The joint of a body and its values, a hinge where it explains most: it was guessed at a side of the hull, which
@@ -136,6 +149,11 @@ impl<'a> Search<'a> {
     pub(super) fn finished(&self, mut body: Body<'a>, errors: [f64; 2]) -> Option<Jointed> {
         let all: Vec<usize> = self.train.iter().chain(&self.left_out).copied().collect();
         body.steps(&all, FINELY.1, 0, |share| (0.6 * 0.1_f64.powf(share), 0.5 * 0.1_f64.powf(share)));
+        self.jointed(&body, errors)
+    }
+
+    /// What a body shows: at the value 0 as it is seen first.
+    pub(super) fn jointed(&self, body: &Body<'a>, errors: [f64; 2]) -> Option<Jointed> {
         let hinge = body.hinge?;
         let start = *body.values.values().next()?;
         let members = body.part_rows();

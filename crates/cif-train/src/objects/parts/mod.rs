@@ -26,15 +26,19 @@ mod tests;
 
 use std::collections::BTreeMap;
 
+use cif_field::Gaussians;
 use cif_field::tracks::JointKind;
-use glam::DQuat;
+use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
+use self::body::Hinge;
 pub(crate) use self::fits::Jointed;
 use self::fits::{FINELY, Fit, keep_kinds};
 use self::guesses::Guess;
 use self::scope::Search;
+use super::discs;
 use super::outline::meeting_point;
+use super::rotation::{Turning, turning};
 use super::shape::Pose;
 use super::start::Object;
 use super::trials::split;
@@ -70,6 +74,47 @@ const MOST_ERROR: f64 = 0.1;
 /// searched for again.
 const PROMISES: [f64; 2] = [0.92, 0.85];
 
+/// Distance from the middle of a ball, in radii, within which Gaussians are its own.
+const OF_BALL: f64 = 1.1;
+
+/// Looks for a ball that turns in place on the rest of its object, as a globe on its stand.
+///
+/// # Errors
+/// [`TrainError::Stopped`] when the run is to stop.
+pub(super) fn turning_ball(object: Object<'_>) -> Result<Option<Jointed>, TrainError> {
+    let phases = object.surroundings.phases;
+    let shown = || object.views.iter().filter(|view| !view.is_sliver());
+    let Some(ball) = discs::ball(shown()) else { return Ok(None) };
+    phases.check()?;
+    let Some(Turning { axis, angles, errors }) = turning(shown(), &ball) else { return Ok(None) };
+    phases.check()?;
+    let rests = Pose { rotation: DQuat::IDENTITY, translation: ball.centre };
+    let base: BTreeMap<usize, Pose> = object.views.iter().map(|view| (view.time_index, rests)).collect();
+    let is_shown = |view: &usize| !object.views[*view].is_sliver();
+    let search = Search::new(object, &base, ((0..object.views.len()).filter(is_shown).collect(), Vec::new()));
+    let hinge = Hinge { kind: JointKind::Revolute, axis, point: DVec3::ZERO };
+    let is_ball = |place: DVec3| place.length() < ball.radius;
+    let is_stand = |place: DVec3| !is_ball(place) && search.is_within(place);
+    let ([of_base, of_part], steps) = FINELY;
+    let stand = search.hull(&base, Some(&is_stand), of_base);
+    let turned = search.hull(&search.posed(hinge, &angles), Some(&is_ball), of_part);
+    let Some((stand, turned)) = stand.zip(turned) else { return Ok(None) };
+    let mut body = search.together((stand, &turned), hinge, &angles);
+    // Light, which stays where it is, would pull the joint back.
+    body.steps(&search.train, 2 * steps, 0, |share| (0.1_f64.powf(share), 0.0));
+    phases.check()?;
+    let Some(mut found) = search.jointed(&body, errors) else { return Ok(None) };
+    // Of the stand what got into the ball showed its light.
+    let keep = |rows: &mut Gaussians, is_kept: &dyn Fn(f64) -> bool| {
+        let distances = rows.means.iter().map(|mean| DVec3::from_array(mean.map(f64::from)).length());
+        let kept: Vec<bool> = distances.map(|distance| is_kept(distance / ball.radius)).collect();
+        rows.retain(&kept);
+    };
+    keep(&mut found.base, &|distance| distance > 1.0);
+    keep(&mut found.part, &|distance| distance < OF_BALL);
+    Ok(Some(found.moved(ball.centre)))
+}
+
 /// Looks for a part on a joint of an object that rests otherwise.
 ///
 /// # Errors
@@ -94,18 +139,7 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
     if times.len() < FEWEST_TIMES {
         return Ok(None);
     }
-    let (train, left_out) = split(views, &reliable, &times);
-    let rotation = base.values().next().map_or(DQuat::IDENTITY, |pose| pose.rotation);
-    let up = object.surroundings.plane.map(|plane| rotation.inverse() * plane.normal);
-    let search = Search {
-        object,
-        base,
-        train,
-        left_out,
-        size: object.outline.size(),
-        up,
-        one_camera: reliable.len() == times.len(),
-    };
+    let search = Search::new(object, base, split(views, &reliable, &times));
     let level = search.level();
     let Some(rough) = search.rigid(&search.train, ROUGH, level) else { return Ok(None) };
     let uncut = rough.mean_loss(&search.train, level);

@@ -2,13 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::super::fit::hull;
 use super::super::shape::{Pose, Shape};
 use super::super::start::{Object, Surroundings};
-use super::super::view::median;
+use super::super::view::{is_one_camera, median};
 use super::body::{Body, Hinge};
 
 /// Most views of a time that values are searched on.
@@ -38,6 +38,19 @@ pub(super) struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
+    /// A search of an object whose poses are known, on views to fit to and views left out.
+    pub(super) fn new(
+        object: Object<'a>,
+        base: &'a BTreeMap<usize, Pose>,
+        (train, left_out): (Vec<usize>, Vec<usize>),
+    ) -> Self {
+        let rotation = base.values().next().map_or(DQuat::IDENTITY, |pose| pose.rotation);
+        let up = object.surroundings.plane.map(|plane| rotation.inverse() * plane.normal);
+        let size = object.outline.size();
+        let one_camera = is_one_camera(train.iter().chain(&left_out).map(|view| &object.views[*view]));
+        Self { object, base, train, left_out, size, up, one_camera }
+    }
+
     /// Reduction at which guesses are compared.
     pub(super) fn level(&self) -> usize {
         let mut areas: Vec<f64> = self.train.iter().map(|view| self.object.views[*view].detail()).collect();

@@ -2,13 +2,15 @@
 
 use std::f64::consts::PI;
 
+use cif_field::Gaussians;
 use cif_field::tracks::JointKind;
 use glam::{DQuat, DVec3};
 use rand::RngExt;
 
+use super::super::discs;
 use super::super::parts;
 use super::super::testing::{
-    Cameras, FLOOR, TIMES, moving, patches, rig, solid, views_of_groups, with_objects,
+    Cameras, FLOOR, TIMES, moving, patches, rig, solid, sphere_places, views_of_groups, with_objects,
 };
 use super::super::view::ObjectView;
 use super::Jointed;
@@ -125,5 +127,76 @@ fn a_box_that_rests_has_no_part() {
     let (base, rest) = places.split_at(1000);
     for cameras in [moving as Cameras, rig] {
         assert!(find(&seen(base, rest, |_| (DQuat::IDENTITY, DVec3::ZERO), cameras)).is_none());
+    }
+}
+
+const BALL: f64 = 0.05;
+const CENTRE: DVec3 = DVec3::new(0.0, 0.0, 0.1);
+
+/// Views of a ball of some colours that turns on its stand, about an axis.
+fn globe(axis: DVec3, degrees: f64, color: fn(DVec3) -> [f32; 3], cameras: Cameras) -> Vec<ObjectView> {
+    let stand = faces(DVec3::new(-0.03, -0.03, 0.0), DVec3::new(0.03, 0.03, 0.02), 500, 25);
+    let pole = faces(DVec3::new(-0.006, -0.006, 0.02), DVec3::new(0.006, 0.006, 0.06), 200, 26);
+    let base: Vec<DVec3> = stand.into_iter().chain(pole).collect();
+    let ball: Vec<DVec3> = sphere_places(BALL).into_iter().map(|place| place + CENTRE).collect();
+    let mut all = solid(&base, |_| [0.3, 0.5, 0.5], 0.006);
+    let turned = solid(&ball, |place| color(place - CENTRE), 0.006);
+    all.append(&turned);
+    let group_of = (0..all.len()).map(|row| u32::from(row >= base.len())).collect();
+    let still = vec![(DQuat::IDENTITY, DVec3::ZERO); TIMES];
+    let pose = |time: usize| {
+        let turn = DQuat::from_axis_angle(axis, degrees.to_radians() * share(time));
+        (turn, CENTRE - turn * CENTRE)
+    };
+    let poses = (0..TIMES).map(pose).collect();
+    views_of_groups(all, group_of, &[still, poses], cameras)
+}
+
+fn turning(views: &[ObjectView]) -> Option<Jointed> {
+    with_objects(Some(&FLOOR), views, |objects| parts::turning_ball(objects[0]).unwrap())
+}
+
+#[test]
+fn a_globe_turns_on_its_stand() {
+    let axis = DVec3::new(0.0, -0.34, 0.94).normalize();
+    for cameras in [moving as Cameras, rig] {
+        let found = turning(&globe(axis, 160.0, patches, cameras)).unwrap();
+        let apart = found.hinge.axis.dot(axis).clamp(-1.0, 1.0).acos().to_degrees();
+        let error = value_error(&found, |share| share * 160.0_f64.to_radians()).to_degrees();
+        let off = (found.hinge.point - CENTRE).length();
+        assert!(apart < 12.0 && error < 25.0 && off < 0.003, "axis {apart} deg, values {error} deg, {off} m");
+        let distances = |rows: &Gaussians| -> Vec<f64> {
+            rows.means.iter().map(|mean| DVec3::from_array(mean.map(f64::from)).distance(CENTRE)).collect()
+        };
+        // The outline is where the Gaussians of the surface are half transparent, which is outside of their means.
+        let farthest = distances(&found.part).into_iter().fold(0.0, f64::max);
+        let nearest = distances(&found.base).into_iter().fold(f64::INFINITY, f64::min);
+        assert!(farthest < 1.4 * BALL && nearest > BALL, "part to {farthest} m, stand from {nearest} m");
+    }
+}
+
+#[test]
+fn a_globe_that_rests_or_is_plain_is_not_seen_to_turn() {
+    for (degrees, color) in [(0.0, patches as fn(DVec3) -> [f32; 3]), (160.0, |_| [0.7, 0.5, 0.3])] {
+        for cameras in [moving as Cameras, rig] {
+            assert!(turning(&globe(DVec3::Z, degrees, color, cameras)).is_none());
+        }
+    }
+}
+
+#[test]
+fn what_is_no_ball_on_a_stand_is_not_taken_for_one() {
+    let boxed = faces(DVec3::new(-0.05, -0.05, 0.0), DVec3::new(0.05, 0.05, 0.1), 1500, 27);
+    let bare: Vec<DVec3> = sphere_places(BALL).into_iter().map(|place| place + DVec3::Z * BALL).collect();
+    for places in [boxed, bare] {
+        for cameras in [moving as Cameras, rig] {
+            let views = views_of_groups(
+                solid(&places, patches, 0.006),
+                vec![0; places.len()],
+                &[vec![(DQuat::IDENTITY, DVec3::ZERO); TIMES]],
+                cameras,
+            );
+            assert!(discs::ball(views.iter()).is_none());
+        }
     }
 }

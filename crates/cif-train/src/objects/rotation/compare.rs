@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::evidence::Evidence;
+use super::evidence::{Evidence, Look};
 
 /// Blocks of time of the jackknife, and the fewest with which a standard error is one.
 const JACKKNIFE: usize = 12;
@@ -15,27 +15,7 @@ const COMMON: u32 = 15;
 /// compared. Differences are means over the pixels of a view that both predict, then over views; their standard error is
 /// that of a jackknife over blocks of time.
 pub(super) fn compared(evidence: &Evidence<'_>, fields: &[&[f32]]) -> Vec<Vec<f64>> {
-    let mut bounds = vec![0];
-    for look in &evidence.looks {
-        bounds.push(bounds[bounds.len() - 1] + look.pixels.len());
-    }
-    let of_view = |a: &[f32], b: &[f32], view: usize| {
-        let range = bounds[view]..bounds[view + 1];
-        let (mut sum, mut count) = (0.0_f64, 0_u32);
-        for (a, b) in a[range.clone()].iter().zip(&b[range]) {
-            if !a.is_nan() && !b.is_nan() {
-                sum += f64::from(b - a);
-                count += 1;
-            }
-        }
-        (count >= COMMON).then(|| sum / f64::from(count))
-    };
-    let pair = |a: usize, b: usize| {
-        let views = (0..evidence.looks.len()).filter_map(|view| {
-            Some((evidence.looks[view].view.time_index, of_view(fields[a], fields[b], view)?))
-        });
-        standard_errors(&views.collect::<Vec<_>>())
-    };
+    let pair = |a: usize, b: usize| standard_errors(&gains(evidence, fields[a], fields[b]));
     let count = fields.len();
     let rows: Vec<Vec<f64>> =
         (0..count).into_par_iter().map(|a| (0..a).map(|b| pair(a, b)).collect()).collect();
@@ -47,8 +27,27 @@ pub(super) fn compared(evidence: &Evidence<'_>, fields: &[&[f32]]) -> Vec<Vec<f6
     (0..count).map(|a| (0..count).map(|b| at(a, b)).collect()).collect()
 }
 
+/// Mean difference of the residuals of two hypotheses by view, with its time: positive where the first is better; of
+/// views with enough pixels that both predict.
+pub(super) fn gains(evidence: &Evidence<'_>, better: &[f32], than: &[f32]) -> Vec<(usize, f64)> {
+    let mut first = 0;
+    let of_view = |look: &Look<'_>| {
+        let range = first..first + look.pixels.len();
+        first = range.end;
+        let (mut sum, mut count) = (0.0_f64, 0_u32);
+        for (a, b) in better[range.clone()].iter().zip(&than[range]) {
+            if !a.is_nan() && !b.is_nan() {
+                sum += f64::from(b - a);
+                count += 1;
+            }
+        }
+        (count >= COMMON).then(|| (look.view.time_index, sum / f64::from(count)))
+    };
+    evidence.looks.iter().filter_map(of_view).collect()
+}
+
 /// Mean of differences by time over its standard error, by a jackknife over blocks of time; NaN where these are few.
-fn standard_errors(differences: &[(usize, f64)]) -> f64 {
+pub(super) fn standard_errors(differences: &[(usize, f64)]) -> f64 {
     let mut times: Vec<usize> = differences.iter().map(|(time, _)| *time).collect();
     times.sort_unstable();
     times.dedup();

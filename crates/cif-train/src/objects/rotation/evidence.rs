@@ -51,15 +51,15 @@ pub(super) struct Evidence<'a> {
 }
 
 impl<'a> Evidence<'a> {
-    /// The views of an object that show most of it; `None` where they are too few.
-    pub(super) fn of(views: &'a [ObjectView]) -> Option<Self> {
-        let reliable: Vec<&ObjectView> = views.iter().filter(|view| view.is_reliable()).collect();
-        let mut areas: Vec<f64> = reliable.iter().map(|view| view.detail()).collect();
+    /// Views of an object, in the order of times; `None` where they are too few.
+    pub(super) fn of(views: impl Iterator<Item = &'a ObjectView>) -> Option<Self> {
+        let views: Vec<&ObjectView> = views.collect();
+        let mut areas: Vec<f64> = views.iter().map(|view| view.detail()).collect();
         let area = cif_geometry::stats::median(&mut areas)?;
         let level = [1.0, 4.0, 16.0].iter().position(|reduced| area / reduced <= LARGE).unwrap_or(2);
         let mut cameras = BTreeMap::new();
-        let mut looks: Vec<Look<'_>> = Vec::with_capacity(reliable.len());
-        for view in &reliable {
+        let mut looks: Vec<Look<'_>> = Vec::with_capacity(views.len());
+        for view in views {
             let count = cameras.len() as u32;
             let camera = *cameras.entry(view.camera_key).or_insert(count);
             let footprint = 1.0 / view.crops[level].camera.focal_px.x;

@@ -25,14 +25,14 @@ use super::layered::layered;
 use super::shaded::shaded;
 
 /// Standard errors by which a hypothesis must beat another.
-const SIGMAS: f64 = 2.0;
+pub(super) const SIGMAS: f64 = 2.0;
 
 /// Difference of two courses of rotation, radians, up to which they are the same to the judge: the truth lies within half
 /// of it of something that is tried.
-const APART: f64 = 30.0 / 180.0 * std::f64::consts::PI;
+pub(super) const APART: f64 = 30.0 / 180.0 * std::f64::consts::PI;
 
 /// Cosine at which a surface is seen too flat to be compared.
-const GRAZING: f64 = 0.3;
+pub(super) const GRAZING: f64 = 0.3;
 
 /// Edge of a voxel, in pixels at the distance of the object: cells of paint are as fine as what is seen of them. Most
 /// voxels along an object, and edge of those of a first rough hull, of its size.
@@ -106,7 +106,7 @@ impl<'a> Judge<'a> {
     /// A judge of an object of this size (the larger of half height and radius, metres) with a first hypothesis, under
     /// which it does not turn; `None` where the views are too few.
     pub(super) fn new(views: &'a [ObjectView], size: f64, unturned: Course) -> Option<Self> {
-        let evidence = Evidence::of(views)?;
+        let evidence = Evidence::of(views.iter().filter(|view| view.is_reliable()))?;
         let footprint = |look: &Look<'_>| {
             let pose = unturned.get(&look.view.time_index)?;
             Some(look.footprint * (pose.translation - look.view.camera.centre()).length())

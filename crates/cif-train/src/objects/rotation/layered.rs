@@ -10,12 +10,13 @@ use super::hull::Hit;
 const SWEEPS: usize = 5;
 
 /// A pixel that a model predicts.
-struct Observation {
-    pixel: usize,
-    look: usize,
-    paint: usize,
-    light: usize,
-    value: DVec3,
+pub(super) struct Observation {
+    pub(super) pixel: usize,
+    pub(super) look: usize,
+    /// Cell of the layer of paint, and of that of light.
+    pub(super) paint: usize,
+    pub(super) light: usize,
+    pub(super) value: DVec3,
 }
 
 /// Absolute residuals of the layered model on left-out pixels, each layer shrunk by one pseudo-observation per cell.
@@ -59,9 +60,9 @@ pub(super) fn layered(
 }
 
 /// Means by cell, view or the like.
-struct Means {
-    values: Vec<DVec3>,
-    weights: Vec<f64>,
+pub(super) struct Means {
+    pub(super) values: Vec<DVec3>,
+    pub(super) weights: Vec<f64>,
 }
 
 impl Means {
@@ -78,15 +79,15 @@ impl Means {
 }
 
 /// The layers of the model, fitted to the observations outside a fold; gains of views to all.
-struct Layers {
+pub(super) struct Layers {
     gain: Means,
     light: Means,
-    paint: Means,
+    pub(super) paint: Means,
     is_fitted: Vec<bool>,
 }
 
 impl Layers {
-    fn start(
+    pub(super) fn start(
         seen: &[Observation],
         (cells, lights, views): (usize, usize, usize),
         is_fitted: impl Fn(&Observation) -> bool,
@@ -107,11 +108,16 @@ impl Layers {
     }
 
     fn residual(&self, o: &Observation) -> DVec3 {
-        o.value - self.gain.values[o.look] - self.light.values[o.light] - self.paint.values[o.paint]
+        self.unpainted(o) - self.paint.values[o.paint]
+    }
+
+    /// The value of a pixel without gain and light.
+    pub(super) fn unpainted(&self, o: &Observation) -> DVec3 {
+        o.value - self.gain.values[o.look] - self.light.values[o.light]
     }
 
     /// One sweep of back-fitting: light, paint, gains.
-    fn sweep(&mut self, seen: &[Observation], turns: bool) {
+    pub(super) fn sweep(&mut self, seen: &[Observation], turns: bool) {
         let fitted = || seen.iter().zip(&self.is_fitted).filter(|(_, is_fitted)| **is_fitted).map(|(o, _)| o);
         let mut light = vec![DVec3::ZERO; self.light.values.len()];
         for o in fitted() {

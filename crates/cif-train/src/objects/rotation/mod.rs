@@ -5,6 +5,7 @@
 //! | `evidence` | which pixels judge |
 //! | `hull` | the shape of an object under a hypothesis, and what pixels see of it |
 //! | `judge` | which rotation they show, and whether they do |
+//! | `turning` | how a ball turns that stays in place |
 //! | `layered`, `shaded` | how well paint and light explain pixels left out |
 //! | `folds`, `compare` | which pixels are left out, and by how many standard errors one hypothesis is better |
 
@@ -17,6 +18,8 @@ mod layered;
 mod shaded;
 #[cfg(test)]
 mod tests;
+mod turning;
 
 pub(super) use self::hull::Course;
 pub(super) use self::judge::{Shown, shown};
+pub(super) use self::turning::{Ball, Turning, turning};
