@@ -113,6 +113,11 @@ pub(crate) fn nearest_to_rays<'a>(
     (normal.determinant().abs() >= least).then(|| normal.inverse() * right)
 }
 
+/// Distance of a point from the ray through a pixel, metres.
+pub(crate) fn distance_to_ray(camera: &PinholeCamera, pixel: DVec2, point: DVec3) -> f64 {
+    (across(camera, pixel) * (point - camera.centre())).length()
+}
+
 /// Projection onto the plane across the ray through a pixel.
 pub(crate) fn across(camera: &PinholeCamera, pixel: DVec2) -> DMat3 {
     let direction = camera.ray(pixel).normalize();

@@ -12,6 +12,7 @@
 //! | `priors` | how it moves where pictures say little |
 //! | `texture`, `ball`, `sphere` | how it turns, where its outline does not tell |
 //! | `ways` | which ways of moving are tried |
+//! | `sequence` | which values over time cost least |
 //! | `follow` | how it moves from time to time |
 //! | `grow` | where it is when little of it is seen |
 //! | `mend` | which of its poses jump, and where they belong |
@@ -39,6 +40,7 @@ mod path;
 mod plane;
 mod priors;
 mod rotation;
+mod sequence;
 mod shape;
 mod sphere;
 mod start;

@@ -9,7 +9,7 @@ use glam::{DMat2, DVec2, DVec3};
 use super::path;
 use super::plane::Plane;
 use super::view::{ObjectView, WITHIN, are_discs, is_one_camera, median, rests};
-use crate::tracks::{across, nearest_to_rays};
+use crate::tracks::{distance_to_ray, nearest_to_rays};
 
 /// Largest apparent size of a mask, relative to that on the plane, at which its object is taken to touch the plane.
 const AIR: f64 = 1.1;
@@ -134,10 +134,9 @@ pub(super) fn meeting_of_rays(rays: &[(&PinholeCamera, DVec2, f64)]) -> Option<D
     if rays.len() < FEWEST_RAYS {
         return nearest(&all);
     }
-    let distance = |(camera, pixel, _): &(&PinholeCamera, DVec2, f64), point: DVec3| {
-        (across(camera, *pixel) * (point - camera.centre())).length()
+    let distances = |point: DVec3| -> Vec<f64> {
+        rays.iter().map(|(camera, pixel, _)| distance_to_ray(camera, *pixel, point)).collect()
     };
-    let distances = |point: DVec3| -> Vec<f64> { rays.iter().map(|ray| distance(ray, point)).collect() };
     // Of the points where two rays meet, and that where all do, the one that is nearest to the middle ray.
     let paired: Vec<usize> = (0..rays.len()).step_by(rays.len().div_ceil(MOST_PAIRED)).collect();
     let pairs = (0..paired.len()).flat_map(|a| (0..a).map(move |b| (a, b)));

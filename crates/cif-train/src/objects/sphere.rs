@@ -5,6 +5,7 @@ use std::f64::consts::PI;
 use glam::{DMat3, DQuat, DVec3, dvec2};
 use nalgebra::{Matrix4, Vector4};
 
+use super::rotation::Ball;
 use super::texture::FEWEST;
 use super::view::{ObjectView, median};
 
@@ -105,14 +106,7 @@ fn samples(view: &ObjectView, centre: DVec3, radius: f64) -> Vec<Sample> {
         let column = pixel as u32 % crop.camera.width;
         let row = pixel as u32 / crop.camera.width;
         let ray = crop.camera.ray(dvec2(f64::from(column) + 0.5, f64::from(row) + 0.5)).normalize();
-        let offset = origin - centre;
-        let (along, beyond) = (offset.dot(ray), offset.length_squared() - radius * radius);
-        let inside = along * along - beyond;
-        if inside < 0.0 {
-            continue;
-        }
-        let outward = (offset - (along + inside.sqrt()) * ray) / radius;
-        let weight = -outward.dot(ray);
+        let Some((outward, weight)) = (Ball { centre, radius }).outward(origin, ray) else { continue };
         if weight > FACING {
             let value = DVec3::from(crop.colors[pixel].map(|c| (f64::from(c) + DARK).ln()));
             found.push(Sample { outward, value, weight });

@@ -10,7 +10,7 @@ use glam::DVec2;
 
 use crate::frames::TrainFrame;
 use crate::mask_table::MaskTable;
-use crate::tracks::across;
+use crate::tracks::distance_to_ray;
 
 /// Pixels around the mask that belong to its crop.
 const MARGIN: u32 = 5;
@@ -157,7 +157,7 @@ impl ObjectView {
 
     /// Distance of a point of the world from the ray through the middle of the mask, metres.
     pub(super) fn distance(&self, point: glam::DVec3) -> f64 {
-        (across(&self.camera, self.centroid) * (point - self.camera.centre())).length()
+        distance_to_ray(&self.camera, self.centroid, point)
     }
 
     /// True where the outline is the object's own.

@@ -9,6 +9,7 @@ use std::f64::consts::{PI, TAU};
 use glam::DVec3;
 use rayon::prelude::*;
 
+use super::super::sequence::{least, unwind};
 use super::super::view::ObjectView;
 use super::compare::{gains, standard_errors};
 use super::evidence::Evidence;
@@ -188,8 +189,8 @@ impl Seen {
             let start = seen.spots.len();
             let origin = shown.view.camera.centre();
             let spot = |(k, pixel): (usize, &super::evidence::Pixel)| {
-                let outward = ball.outward(origin, pixel.ray)?;
-                Some(Spot { pixel: first + k, look, outward, value: pixel.value })
+                let (outward, facing) = ball.outward(origin, pixel.ray.normalize())?;
+                (facing > GRAZING).then_some(Spot { pixel: first + k, look, outward, value: pixel.value })
             };
             let found: Vec<Spot> = shown.pixels.iter().enumerate().filter_map(spot).collect();
             let step = found.len().div_ceil(most).max(1);
@@ -261,13 +262,17 @@ impl Seen {
 }
 
 impl Ball {
-    /// Unit vector from the middle to where a ray meets the ball; `None` where it passes by, or meets it too flatly.
-    fn outward(&self, origin: DVec3, ray: DVec3) -> Option<DVec3> {
-        let (ray, offset) = (ray.normalize(), (origin - self.centre) / self.radius);
-        let along = offset.dot(ray);
-        let inside = along * along - offset.length_squared() + 1.0;
-        let outward = offset - (along + inside.max(0.0).sqrt()) * ray;
-        (inside > 0.0 && -outward.dot(ray) > GRAZING).then_some(outward)
+    /// Unit vector from the middle to where a ray of unit length meets the ball, with the cosine at which it does; `None`
+    /// where it passes by.
+    pub(in super::super) fn outward(&self, origin: DVec3, ray: DVec3) -> Option<(DVec3, f64)> {
+        let offset = origin - self.centre;
+        let (along, beyond) = (offset.dot(ray), offset.length_squared() - self.radius * self.radius);
+        let inside = along * along - beyond;
+        if inside < 0.0 {
+            return None;
+        }
+        let outward = (offset - (along + inside.sqrt()) * ray) / self.radius;
+        Some((outward, -outward.dot(ray)))
     }
 }
 
@@ -414,32 +419,15 @@ impl Painted<'_> {
     /// The sequence of turns of least error that changes little from time to time, and its mean cost.
     fn evenest(&self, errors: &[Vec<f64>], turns: usize) -> (Vec<f64>, f64) {
         let step = TAU / turns as f64;
-        let mut sums = errors[0].clone();
-        let mut before: Vec<Vec<usize>> = Vec::with_capacity(errors.len());
-        for time in 1..errors.len() {
-            let apart = (self.seen.times[time] - self.seen.times[time - 1]) as f64;
-            let cost_of: Vec<f64> = (0..turns)
-                .map(|k| self.seen.uneven() * (step * k.min(turns - k) as f64).powi(2) / apart)
-                .collect();
-            let reached = |to: usize| {
-                let cost = |from: usize| sums[from] + cost_of[from.abs_diff(to)];
-                let from = (0..turns).min_by(|a, b| cost(*a).total_cmp(&cost(*b))).unwrap_or(to);
-                (from, cost(from) + errors[time][to])
-            };
-            let next: Vec<(usize, f64)> = (0..turns).map(reached).collect();
-            sums = next.iter().map(|(_, sum)| *sum).collect();
-            before.push(next.into_iter().map(|(from, _)| from).collect());
-        }
-        let mut at = (0..turns).min_by(|a, b| sums[*a].total_cmp(&sums[*b])).unwrap_or(0);
-        let cost = sums[at] / errors.len() as f64;
-        let mut angles = vec![step * at as f64];
-        for row in before.iter().rev() {
-            at = row[at];
-            let next = angles[angles.len() - 1];
-            let turn = step * at as f64 - next;
-            angles.push(next + turn - (turn / TAU).round() * TAU);
-        }
-        angles.reverse();
-        (angles, cost)
+        let (times, uneven) = (&self.seen.times, self.seen.uneven());
+        let cost = |time: usize, from: usize, to: usize| {
+            let apart = (times[time] - times[time.saturating_sub(1)]).max(1) as f64;
+            let turned = from.abs_diff(to);
+            uneven * (step * turned.min(turns - turned) as f64).powi(2) / apart
+        };
+        let (places, sum) = least(errors, cost);
+        let mut angles: Vec<f64> = places.iter().map(|place| step * *place as f64).collect();
+        unwind(angles.iter_mut());
+        (angles, sum / errors.len() as f64)
     }
 }
