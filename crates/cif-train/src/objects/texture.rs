@@ -1,7 +1,6 @@
-//! Turns of an object about the upright axis, as several cameras see it, or of a bar about its long axis, read from its
-//! texture: solids of revolution, whose outline is the same from all sides, show them by nothing else. The surface is
-//! unrolled from a cylinder at every
-//! time; what stays in place between times is light, and what moves around tells the turn.
+//! Turns of an object about the upright axis, as several cameras see it, read from its texture: solids of revolution, whose
+//! outline is the same from all sides, show them by nothing else. The surface is unrolled from a cylinder at every time;
+//! what stays in place between times is light, and what moves around tells the turn.
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
@@ -10,7 +9,6 @@ use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::outline::Outline;
-use super::shape::Pose;
 use super::view::ObjectView;
 
 /// Places around and along the axis at which the surface is looked at.
@@ -38,18 +36,15 @@ const SMALLEST: f64 = 60.0;
 const EXPLAINED: f64 = 0.2;
 const RIVAL: f64 = 120.0;
 
-/// How many times what the middle of all turns explains, and the best rival, the turn must: of any turn, and of one that
-/// rolling lets expect.
-const CLEAR: [(f64, f64); 2] = [(3.0, 1.5), (1.5, 1.25)];
+/// How many times what the middle of all turns explains, and the best rival, the turn must.
+const ABOVE_CHANCE: f64 = 3.0;
+const ABOVE_RIVAL: f64 = 1.5;
 
 /// Root mean square of the texture, relative to its brightness, below which it may be noise.
 const FAINT: f64 = 0.02;
 
 /// Turns around what a constant rate tells that are tried at each time, places around, and rounds of that.
 const REFINED: (i64, usize) = (3, 3);
-
-/// Turn of a bar, of that of rolling without slip, from which it rolls, and up to which it is looked for.
-const SLIPS: (f64, f64) = (0.7, 1.4);
 
 /// Fewest times that are compared.
 pub(super) const FEWEST: usize = 8;
@@ -96,35 +91,8 @@ pub(super) fn turns<'a>(
     let (first, last) = (*at.keys().next()?, *at.keys().next_back()?);
     let shares: Vec<f64> = at.keys().map(|time| (time - first) as f64 / (last - first) as f64).collect();
     let surfaces = unrolled(&at, cylinder);
-    let (_, found) = told(&surfaces, &shares, FASTEST * (last - first) as f64, CLEAR[0])?;
+    let found = told(&surfaces, &shares, FASTEST * (last - first) as f64)?;
     Some(at.keys().zip(found).map(|(time, turn)| (*time, DQuat::from_scaled_axis(turn * up))).collect())
-}
-
-/// Turns, radians, of a bar about its long axis by time that explain how its texture goes around, near those of
-/// rolling without slip; `None` where it does not tell them. `poses` are those without these turns, `axis` is its long
-/// axis in its own frame, and `rolled` tells the turns of rolling by time.
-pub(super) fn rolls<'a>(
-    views: impl Iterator<Item = &'a ObjectView>,
-    poses: &BTreeMap<usize, Pose>,
-    (axis, up): (DVec3, DVec3),
-    rolled: &BTreeMap<usize, f64>,
-    outline: &Outline,
-) -> Option<BTreeMap<usize, f64>> {
-    let at = by_time(views, |time| poses.contains_key(&time))?;
-    let cylinder = |time: &usize| {
-        let axis = poses[time].rotation * axis;
-        Cylinder {
-            centre: poses[time].translation,
-            axis,
-            across: (up - up.dot(axis) * axis).normalize_or(axis.any_orthonormal_vector()),
-            radius: outline.height,
-            half_length: outline.radius,
-        }
-    };
-    let most = at.keys().map(|time| rolled[time].abs()).fold(0.0, f64::max);
-    let shares: Vec<f64> = at.keys().map(|time| rolled[time] / most.max(1e-9)).collect();
-    let (total, found) = told(&unrolled(&at, cylinder), &shares, SLIPS.1 * most.to_degrees(), CLEAR[1])?;
-    (total >= SLIPS.0 * most.to_degrees()).then(|| at.keys().copied().zip(found).collect())
 }
 
 /// Views by time, where there are enough.
@@ -147,14 +115,9 @@ fn unrolled(at: &Views<'_>, cylinder: impl Fn(&usize) -> Cylinder + Sync) -> Vec
     surfaces
 }
 
-/// Total turn, degrees, at most `most` either way, that explains surfaces best when they turn by shares of it, and the
-/// turn of each, radians; `None` where the texture does not tell.
-fn told(
-    surfaces: &[Surface],
-    shares: &[f64],
-    most: f64,
-    (above_chance, above_rival): (f64, f64),
-) -> Option<(f64, Vec<f64>)> {
+/// Turns of surfaces, radians, by the total turn, at most `most` degrees either way, that explains them best when they turn
+/// by shares of it; `None` where the texture does not tell.
+fn told(surfaces: &[Surface], shares: &[f64], most: f64) -> Option<Vec<f64>> {
     let places = |total: f64| -> Vec<f64> {
         shares.iter().map(|share| share * total / 360.0 * AROUND as f64).collect()
     };
@@ -167,14 +130,14 @@ fn told(
     let chance = sorted[sorted.len() / 2];
     let is_rival = |k: &usize| (totals[*k] - totals[best]).abs() > RIVAL;
     let rival = (0..totals.len()).filter(is_rival).map(|k| scores[k]).fold(0.0, f64::max);
-    let is_told = scores[best] > EXPLAINED.max(above_chance * chance).max(above_rival * rival);
+    let is_told = scores[best] > EXPLAINED.max(ABOVE_CHANCE * chance).max(ABOVE_RIVAL * rival);
     let seen: f64 = surfaces.iter().flat_map(|surface| &surface.weights).sum();
     let strength = (scores[best] * surfaces.iter().map(power).sum::<f64>() / seen.max(1e-9)).sqrt();
     if !is_told || strength < FAINT || totals[best].abs() < SMALLEST {
         return None;
     }
     let found = refined(surfaces, places(totals[best]));
-    Some((totals[best], found.iter().map(|place| place / AROUND as f64 * TAU).collect()))
+    Some(found.iter().map(|place| place / AROUND as f64 * TAU).collect())
 }
 
 /// The surface of a cylinder, as views of one time show it.

@@ -12,11 +12,12 @@ use super::fit::{Fit, Turns};
 use super::follow::follow;
 use super::outline::Outline;
 use super::path::smooth;
-use super::rotation::{Course, Shown, shown};
+use super::rotation::{Course, Revolving, Shown, shown};
+use super::shape::Pose;
 use super::start::{Object, Started};
 use super::texture;
-use super::view::ObjectView;
-use super::ways::{Bar, Paths, SMALLEST_SPIN, Way, is_round};
+use super::view::{ObjectView, are_discs};
+use super::ways::{Paths, SMALLEST_SPIN, Way, is_round};
 use crate::error::TrainError;
 
 /// Gaussians of a trial.
@@ -71,12 +72,14 @@ const FOLLOW_GAIN: [f64; 2] = [0.98, 0.85];
 const STRAINED: f64 = 1.15;
 const OFF_GAIN: f64 = 0.85;
 
-/// Largest error of turning as texture tells, relative to the best other way: a few Gaussians without texture prefer
-/// no turn.
+/// Largest error of turning as texture tells, relative to the best other way: a few Gaussians without texture prefer no
+/// turn.
 const TEXTURE_GAIN: f64 = 1.3;
 
-/// The same of the turn of a bar about its long axis, which light, staying where it is, argues against.
-const LONG_GAIN: f64 = 1.6;
+/// Share of the pixels of an object that a solid of revolution about an axis across its path covers, and how much more than
+/// one about the upright axis, from which it lies, and rolls. Bars and a can that roll: 0.83 and 0.31 more and above,
+/// others at most 0.12 more.
+const LIES: [f64; 2] = [0.8, 0.2];
 
 /// Largest error of rolling, relative to that of sliding, at which rolling is preferred: of most objects, and of round
 /// ones.
@@ -145,7 +148,7 @@ pub(super) fn best_way<'a>(
             reference,
             followed: None,
             off: Vec::new(),
-            textured: None,
+            turned: None,
         },
         train,
         left_out,
@@ -159,7 +162,7 @@ pub(super) fn best_way<'a>(
         simple.iter().find(|trial| may_deform && trial.way == Way::Rest).map(|Trial { fit, .. }| {
             (object.fit(fit.poses.clone(), fit.shape.copied(), fit.rng.clone()), fit.trial_level())
         });
-    let trials = if let Some(textured) = contest.textured(&simple, reliable)? {
+    let trials = if let Some(textured) = contest.textured(&simple, (reliable, stays))? {
         vec![textured]
     } else if object.is_told {
         contest.along_the_path(simple)?
@@ -193,8 +196,9 @@ pub(super) fn best_way<'a>(
     {
         return Ok(None);
     }
-    let bent = (losses[1] > DOUBTED && !object.is_told)
-        .then(|| bend::gain(&fit, views_of_trials, fit.trial_level()));
+    let may_bend = !object.is_told && way != Way::Lies;
+    let bent =
+        (losses[1] > DOUBTED && may_bend).then(|| bend::gain(&fit, views_of_trials, fit.trial_level()));
     // What stays in place and looks otherwise in every turn deforms, or opens. Of thin things the outline, which is never
     // exact, is most of what is seen: they are solid where bending explains no more.
     let most = match simple_errors[0] {
@@ -216,7 +220,7 @@ pub(super) fn best_way<'a>(
         (RotationEvidence::Assumed, _) => (Turns::Given, None),
         (_, Way::Roll(factor)) => (Turns::Free, Some(outline.height / factor)),
         // Light, which stays where it is, would pull it back.
-        (_, Way::Textured) => (Turns::Given, None),
+        (_, Way::Textured | Way::Lies) => (Turns::Given, None),
         _ => (Turns::Free, None),
     };
     let unturned = simple_errors[1];
@@ -246,38 +250,62 @@ impl<'a> Contest<'a> {
         Ok(trials)
     }
 
-    /// Turning as texture tells, where it does and the outline says nothing else.
+    /// Turning as texture tells, where it does and the outline says nothing else, or rolling of what lies on its side.
     fn textured(
         &mut self,
         simple: &[Trial<'_>],
-        reliable: &[usize],
+        (reliable, stays): (&[usize], bool),
     ) -> Result<Option<Trial<'a>>, TrainError> {
-        let seen = reliable.iter().map(|view| &self.object.views[*view]);
-        let (outline, up, reference) = (self.object.outline, self.paths.up, self.paths.reference);
-        let slides = simple.iter().find(|trial| trial.way == Way::Slide(0)).map(|trial| &trial.fit);
-        let bar = slides.and_then(|fit| Bar::of(fit.shape.gaussians(), &fit.poses, up));
-        let most = if bar.is_some() { LONG_GAIN } else { TEXTURE_GAIN };
-        self.paths.textured = if let Some(bar) = bar {
-            let rolled = bar.rolled(up, outline.height, reference);
-            let turns = texture::rolls(seen, &bar.poses, (bar.axis, up), &rolled, outline);
-            turns.map(|turns| bar.turned(&turns))
-        } else {
-            let mut turns = texture::turns(seen.clone(), &self.paths.along, outline, up);
-            // What stays in place neither rolls nor flies.
-            if turns.is_none() && self.paths.shifts() {
-                let seen: Vec<&ObjectView> = seen.collect();
-                turns = ball::turns(&seen, &self.paths.along, outline, &self.paths.rolls());
-            }
-            turns.map(|turns| self.paths.turned(&turns))
-        };
-        if self.paths.textured.is_none() {
-            return Ok(None);
-        }
-        let mut trials = self.begin(&[Way::Textured], GAUSSIANS);
+        let Some((way, poses)) = self.turned(simple, (reliable, stays)) else { return Ok(None) };
+        self.paths.turned = Some(poses);
+        let mut trials = self.begin(&[way], GAUSSIANS);
         self.advance(&mut trials, (0, STEPS[1]), false)?;
         self.judge(&mut trials, false);
         let least = simple.iter().map(|trial| trial.losses[1]).fold(f64::INFINITY, f64::min);
-        Ok(trials.pop().filter(|trial| trial.losses[1] <= most * least))
+        // Light, which stays where it is, argues against rolling.
+        let is_kept = |error: f64| way == Way::Lies || error <= TEXTURE_GAIN * least;
+        Ok(trials.pop().filter(|trial| is_kept(trial.losses[1])))
+    }
+
+    /// Poses of rolling of what lies, or with turns that its texture tells.
+    fn turned(
+        &self,
+        simple: &[Trial<'_>],
+        (reliable, stays): (&[usize], bool),
+    ) -> Option<(Way, BTreeMap<usize, Pose>)> {
+        let (outline, paths) = (self.object.outline, &self.paths);
+        let seen: Vec<&ObjectView> = reliable.iter().map(|view| &self.object.views[*view]).collect();
+        if let Some(lying) = self.lying(simple, &seen).filter(|_| !stays) {
+            return Some((Way::Lies, lying));
+        }
+        let mut turns = texture::turns(seen.iter().copied(), &paths.along, outline, paths.up);
+        // What stays in place neither rolls nor flies.
+        if turns.is_none() && paths.shifts() {
+            turns = ball::turns(&seen, &paths.along, outline, &paths.rolls());
+        }
+        Some((Way::Textured, paths.along_with(&turns?)))
+    }
+
+    /// Poses of rolling without slip about an axis across the path, where the object is a solid of revolution about it.
+    fn lying(&self, simple: &[Trial<'_>], seen: &[&ObjectView]) -> Option<BTreeMap<usize, Pose>> {
+        if are_discs(seen.iter().copied()) {
+            return None;
+        }
+        let slides = simple.iter().find(|trial| trial.way == Way::Slide(0))?;
+        let height = self.object.surroundings.plane.and_then(|plane| {
+            let heights = slides.fit.poses.values().map(|pose| plane.height(pose.translation));
+            cif_geometry::stats::median(&mut heights.collect::<Vec<_>>())
+        });
+        let revolving = Revolving::new(
+            seen.iter().copied(),
+            self.object.outline.size(),
+            &slides.fit.poses,
+            (self.paths.up, height),
+        )?;
+        let axis = self.paths.across()?;
+        let covered = revolving.covered(axis);
+        let lies = covered > LIES[0] && covered > LIES[1] + revolving.covered(self.paths.up);
+        if lies { revolving.rolled(axis) } else { None }
     }
 
     /// True where views of all sides show how it turns from time to time, or it is lifted from where it stood, so that
@@ -372,7 +400,7 @@ impl<'a> Contest<'a> {
             }
             let mut fit = self.object.fit(poses, shape, rng);
             (fit.turns, fit.rolls) = match way {
-                Way::Rest => (Turns::Given, None),
+                Way::Rest | Way::Lies => (Turns::Given, None),
                 Way::Slide(_) | Way::Spin(_) => (Turns::Upright, None),
                 Way::Roll(factor) => (Turns::Free, Some(self.paths.outline.height / factor)),
                 Way::Followed | Way::Textured => (Turns::Free, None),

@@ -3,10 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use cif_field::Gaussians;
-use cif_geometry::scalar::direct_sigmoid;
 use glam::{DQuat, DVec3};
-use nalgebra::{Matrix3, Vector3};
 
 use super::outline::Outline;
 use super::shape::Pose;
@@ -24,9 +21,6 @@ const ROLLS: [f64; 9] = [0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08];
 
 /// Rolling radii tried of other things, whose height tells it less well.
 const OTHER_ROLLS: [f64; 12] = [0.64, 0.68, 0.72, 0.76, 0.8, 0.84, 0.88, 0.92, 0.96, 1.0, 1.04, 1.08];
-
-/// Length of a bar in its widths, and the cosine between its long axis and the normal up to which it lies.
-const BAR: (f64, f64) = (2.0, 0.3);
 
 /// Roundness of masks from which an object may roll as a ball.
 const ROUND: f64 = 0.93;
@@ -54,8 +48,10 @@ pub(super) enum Way {
     Roll(f64),
     /// As following it from time to time found.
     Followed,
-    /// Along the path, turning about the normal, or its own long axis, as its texture tells.
+    /// Along the path, turning as its texture tells.
     Textured,
+    /// Along the path, rolling about an axis that lies across it.
+    Lies,
 }
 
 impl Way {
@@ -68,6 +64,7 @@ impl Way {
             Self::Roll(factor) => format!("rolls with {factor:.2} of its height"),
             Self::Followed => "followed from time to time".to_owned(),
             Self::Textured => "turns as its texture tells".to_owned(),
+            Self::Lies => "rolls on its side".to_owned(),
         }
     }
 
@@ -97,8 +94,8 @@ pub(super) struct Paths<'a> {
     pub(super) followed: Option<BTreeMap<usize, Pose>>,
     /// Times at which it may be off its support in these.
     pub(super) off: Vec<usize>,
-    /// Poses with turns that its texture tells, where it does.
-    pub(super) textured: Option<BTreeMap<usize, Pose>>,
+    /// Poses with turns that its texture tells, or of rolling on its side.
+    pub(super) turned: Option<BTreeMap<usize, Pose>>,
 }
 
 /// True where masks are round enough for a ball.
@@ -123,6 +120,12 @@ impl Paths<'_> {
         let flies = self.outline.is_surrounded && !self.outline.air.is_empty();
         let is_low = self.outline.height <= ROLLS_UP_TO * self.outline.radius;
         self.stands && !flies && is_low && self.reach() >= ROLLS_FROM * self.outline.size()
+    }
+
+    /// Axis about which what rolls along the path turns forward; `None` where it ends where it began.
+    pub(super) fn across(&self) -> Option<DVec3> {
+        let (first, last) = self.along.values().next().zip(self.along.values().next_back())?;
+        self.up.cross(*last - *first).try_normalize()
     }
 
     /// Ways of moving along the path worth a trial, beside sliding without a turn.
@@ -159,7 +162,7 @@ impl Paths<'_> {
     }
 
     /// Poses along the path with turns, from none at the reference; between times that have one it turns evenly.
-    pub(super) fn turned(&self, turns: &BTreeMap<usize, DQuat>) -> BTreeMap<usize, Pose> {
+    pub(super) fn along_with(&self, turns: &BTreeMap<usize, DQuat>) -> BTreeMap<usize, Pose> {
         let turn = |time: usize| {
             let before = turns.range(..=time).next_back();
             let after = turns.range(time..).next();
@@ -208,8 +211,8 @@ impl Paths<'_> {
                 let back = rotations[origin].inverse();
                 rotations.into_iter().map(|rotation| rotation * back).collect()
             }
-            Way::Followed | Way::Textured => {
-                let found = if way == Way::Followed { &self.followed } else { &self.textured };
+            Way::Followed | Way::Textured | Way::Lies => {
+                let found = if way == Way::Followed { &self.followed } else { &self.turned };
                 return found
                     .iter()
                     .flatten()
@@ -223,67 +226,6 @@ impl Paths<'_> {
         let pose = |(k, rotation)| (times[k], Pose { rotation, translation: place(k) });
         rotations.into_iter().enumerate().map(pose).collect()
     }
-}
-
-/// A bar that lies: its poses without turns about its long axis, and that axis in its own frame.
-pub(super) struct Bar {
-    pub(super) poses: BTreeMap<usize, Pose>,
-    pub(super) axis: DVec3,
-}
-
-impl Bar {
-    /// The bar that Gaussians in poses are, if they are long and lie.
-    pub(super) fn of(gaussians: &Gaussians, poses: &BTreeMap<usize, Pose>, up: DVec3) -> Option<Self> {
-        Some(Self { axis: long_axis(gaussians, up)?, poses: poses.clone() })
-    }
-
-    /// Turns about its long axis by time, radians, as far as it goes across it; from zero at `reference`.
-    pub(super) fn rolled(&self, up: DVec3, radius: f64, reference: usize) -> BTreeMap<usize, f64> {
-        let mut angle = 0.0;
-        let mut angles = BTreeMap::new();
-        let mut last: Option<&Pose> = None;
-        for (time, pose) in &self.poses {
-            if let Some(last) = last {
-                let turn = up.cross(pose.translation - last.translation) / radius;
-                angle += turn.dot(pose.rotation * self.axis);
-            }
-            angles.insert(*time, angle);
-            last = Some(pose);
-        }
-        let origin = angles.get(&reference).copied().unwrap_or(0.0);
-        angles.values_mut().for_each(|angle| *angle -= origin);
-        angles
-    }
-
-    /// Its poses, turned about its long axis.
-    pub(super) fn turned(&self, turns: &BTreeMap<usize, f64>) -> BTreeMap<usize, Pose> {
-        let pose = |(time, pose): (&usize, &Pose)| {
-            let turn = DQuat::from_axis_angle(self.axis, *turns.get(time)?);
-            Some((*time, Pose { rotation: pose.rotation * turn, ..*pose }))
-        };
-        self.poses.iter().filter_map(pose).collect()
-    }
-}
-
-/// Long axis of Gaussians, as of a bar that lies in a plane.
-fn long_axis(gaussians: &Gaussians, up: DVec3) -> Option<DVec3> {
-    let weight = |row: usize| direct_sigmoid(f64::from(gaussians.opacity_logits[row]));
-    let place = |row: usize| DVec3::from_array(gaussians.means[row].map(f64::from));
-    let rows = || 0..gaussians.len();
-    let total: f64 = rows().map(weight).sum();
-    let middle = rows().map(|row| weight(row) * place(row)).sum::<DVec3>() / total.max(1e-9);
-    let mut moments = Matrix3::zeros();
-    for row in rows() {
-        let d = Vector3::from((place(row) - middle).to_array());
-        moments += weight(row) * d * d.transpose();
-    }
-    let eigen = moments.symmetric_eigen();
-    let mut order = [0, 1, 2];
-    order.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
-    let axis = eigen.eigenvectors.column(order[0]);
-    let axis = DVec3::new(axis[0], axis[1], axis[2]);
-    let is_long = eigen.eigenvalues[order[0]] > BAR.0 * BAR.0 * eigen.eigenvalues[order[1]];
-    (is_long && axis.dot(up).abs() < BAR.1).then_some(axis)
 }
 
 /// Turns of a ball that rolls without slip from place to place.
@@ -316,7 +258,7 @@ mod tests {
                 reference: 0,
                 followed: None,
                 off: Vec::new(),
-                textured: None,
+                turned: None,
             };
             paths.ways().iter().any(|way| matches!(way, Way::Roll(_)))
         };

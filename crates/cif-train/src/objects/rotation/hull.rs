@@ -7,6 +7,7 @@ use glam::DVec3;
 
 use super::super::shape::Pose;
 use super::super::view::{ObjectView, Seen};
+use super::evidence::{Evidence, Look};
 
 /// Share of the views that see a voxel which may show it outside the mask: masks are a pixel off here and there.
 const OUTSIDE: f64 = 0.12;
@@ -25,6 +26,35 @@ const KERNEL: [f32; 4] = [0.399_05, 0.242_04, 0.054_01, 0.004_43];
 
 /// Most views that carve: more do not change the hull.
 const CARVING: usize = 48;
+
+/// Edge of a voxel, in pixels at the distance of the object: cells of paint are as fine as what is seen of them. Most
+/// voxels along an object, and edge of those of a first rough hull, of its size.
+const VOXEL: f64 = 1.5;
+const MOST_ALONG: f64 = 64.0;
+const ROUGH: f64 = 0.12;
+
+/// Reach of the first hull, in sizes of the object.
+const REACH: f64 = 1.3;
+
+/// Share of a ring around an axis that is inside a hull, from which a solid of revolution has it, and steps by which the
+/// axis is moved, in voxels.
+const RING: f64 = 0.85;
+const MOVED: [f64; 3] = [2.0, 1.0, 0.5];
+
+/// Voxels that a solid reaches beyond its last full ring: of four things that roll 0.06, 0.14, 0.3 and 0.55.
+const BEYOND: f64 = 0.25;
+
+/// Half voxels by which a solid is moved deeper, or towards the cameras, onto its support.
+const DEEPER: i32 = 24;
+
+/// A support on which a solid lies, in the frame of the object.
+pub(super) struct Contact {
+    /// Its unit normal, and the height of the origin above it, metres.
+    pub(super) up: DVec3,
+    pub(super) height: f64,
+    /// Unit, away from the cameras and across the axis.
+    pub(super) depth: DVec3,
+}
 
 /// A hypothesis: world from object by time.
 pub(in super::super) type Course = BTreeMap<usize, Pose>;
@@ -88,9 +118,41 @@ pub(super) struct Hit {
     pub(super) normal: DVec3,
     /// Cosine between the normal and the direction to the camera.
     pub(super) facing: f64,
+    /// The point, in the frame of the object.
+    pub(super) place: DVec3,
+}
+
+/// Edge of a voxel, metres, of an object of this size on a course; `None` where no view has a pose.
+pub(super) fn voxel(evidence: &Evidence<'_>, size: f64, course: &Course) -> Option<f64> {
+    let footprint = |look: &Look<'_>| {
+        let pose = course.get(&look.view.time_index)?;
+        Some(look.footprint * (pose.translation - look.view.camera.centre()).length())
+    };
+    let mut footprints: Vec<f64> = evidence.looks.iter().filter_map(footprint).collect();
+    let voxel = VOXEL * cif_geometry::stats::median(&mut footprints)?;
+    Some(voxel.max(2.0 * REACH * size / MOST_ALONG))
 }
 
 impl Hull {
+    /// The hull of an object of this size, in voxels of this edge, on a course.
+    pub(super) fn of(evidence: &Evidence<'_>, (size, voxel): (f64, f64), course: &Course) -> Self {
+        let views: Vec<&ObjectView> = evidence.looks.iter().map(|look| look.view).collect();
+        let reach = DVec3::splat(REACH * size);
+        let rough = Grid::over(-reach, reach, ROUGH * size);
+        let bounds = Self::carved(rough, &views, course).bounds().unwrap_or((DVec3::ZERO, DVec3::ZERO));
+        let margin = DVec3::splat(0.5 * ROUGH * size);
+        let grid = Grid::over(bounds.0 - margin, bounds.1 + margin, voxel);
+        Self::carved(grid, &views, course)
+    }
+
+    /// Middle of what is inside; `None` where there is nothing.
+    pub(super) fn middle(&self) -> Option<DVec3> {
+        let full = self.grid.places().filter(|at| self.inside[self.grid.index(*at)]);
+        let (sum, count) =
+            full.fold((DVec3::ZERO, 0.0), |(sum, n), at| (sum + self.grid.centre(at), n + 1.0));
+        (count > 0.0).then(|| sum / count)
+    }
+
     /// Carves a grid by the masks of views whose times have poses; pixels of what may hide the object say nothing.
     pub(super) fn carved(grid: Grid, views: &[&ObjectView], poses: &Course) -> Self {
         let posed: Vec<(&ObjectView, &Pose)> =
@@ -121,6 +183,79 @@ impl Hull {
         Self { grid, field, inside }
     }
 
+    /// The largest solid of revolution about an axis of this direction inside the hull, and a point of the axis. How deep it
+    /// lies outlines from one side hardly tell: it touches what it lies on.
+    pub(super) fn revolved(&self, axis: DVec3, contact: Option<&Contact>) -> Option<(Self, DVec3)> {
+        let mut best = self.middle().map(|middle| (self.rings(axis, middle), middle))?;
+        let (first, second) = axis.any_orthonormal_pair();
+        for step in MOVED {
+            loop {
+                let moved =
+                    [first, -first, second, -second].map(|aside| best.1 + step * self.grid.voxel * aside);
+                let tried = moved.map(|middle| (self.rings(axis, middle), middle));
+                let larger = tried.into_iter().max_by_key(|(rings, _)| volume_of(rings));
+                match larger {
+                    Some(larger) if volume_of(&larger.0) > volume_of(&best.0) => best = larger,
+                    _ => break,
+                }
+            }
+        }
+        if let Some(contact) = contact {
+            let most = volume_of(&best.0);
+            let step = 0.5 * self.grid.voxel * contact.depth;
+            let deeper = (-DEEPER..=DEEPER).map(|k| best.1 + f64::from(k) * step);
+            let solids = deeper.map(|middle| (self.rings(axis, middle), middle));
+            let off = |(rings, middle): &(BTreeMap<i64, i64>, DVec3)| {
+                (contact.height + contact.up.dot(*middle) - self.radius(rings)).abs()
+            };
+            let solids = solids.filter(|(rings, _)| 2 * volume_of(rings) > most);
+            best = solids.min_by(|a, b| off(a).total_cmp(&off(b)))?;
+        }
+        let (rings, middle) = best;
+        let is_inside = |at: [usize; 3]| {
+            let (along, out) = self.ring(axis, self.grid.centre(at) - middle);
+            rings.get(&along).is_some_and(|full| out < *full)
+        };
+        let inside: Vec<bool> = self.grid.places().map(is_inside).collect();
+        let field = smoothed(&self.grid, &inside);
+        Some((Self { grid: self.grid, field, inside }, middle))
+    }
+
+    /// Largest radius of rings, metres.
+    fn radius(&self, rings: &BTreeMap<i64, i64>) -> f64 {
+        rings.values().max().map_or(0.0, |rings| (*rings as f64 + BEYOND) * self.grid.voxel)
+    }
+
+    /// Radius of the solid about an axis through a point, metres.
+    pub(super) fn radius_about(&self, axis: DVec3, middle: DVec3) -> f64 {
+        self.radius(&self.rings(axis, middle))
+    }
+
+    /// Distances along an axis and from it, in voxels.
+    fn ring(&self, axis: DVec3, place: DVec3) -> (i64, i64) {
+        let along = place.dot(axis);
+        let out = (place - along * axis).length();
+        ((along / self.grid.voxel).floor() as i64, (out / self.grid.voxel).floor() as i64)
+    }
+
+    /// How many rings around an axis are inside, from the axis on, by the distance along it.
+    fn rings(&self, axis: DVec3, middle: DVec3) -> BTreeMap<i64, i64> {
+        let mut found: BTreeMap<(i64, i64), (u32, u32)> = BTreeMap::new();
+        for at in self.grid.places() {
+            let (inside, all) = found.entry(self.ring(axis, self.grid.centre(at) - middle)).or_default();
+            *inside += u32::from(self.inside[self.grid.index(at)]);
+            *all += 1;
+        }
+        let mut rings: BTreeMap<i64, i64> = BTreeMap::new();
+        for ((along, out), (inside, all)) in found {
+            let full = rings.entry(along).or_default();
+            if out <= *full && f64::from(inside) >= RING * f64::from(all) {
+                *full = out + 1;
+            }
+        }
+        rings
+    }
+
     /// Volume, cubic metres.
     pub(super) fn volume(&self) -> f64 {
         self.inside.iter().filter(|inside| **inside).count() as f64 * self.grid.voxel.powi(3)
@@ -141,8 +276,14 @@ impl Hull {
         self.grid.len()
     }
 
+    /// What a ray in the world meets of the object in a pose; `None` where it passes by.
+    pub(super) fn met(&self, pose: &Pose, origin: DVec3, ray: DVec3) -> Option<Hit> {
+        let back = pose.rotation.inverse();
+        self.hit(back * (origin - pose.translation), back * ray)
+    }
+
     /// The first point of the surface along a ray; `None` where it passes by.
-    pub(super) fn hit(&self, origin: DVec3, ray: DVec3) -> Option<Hit> {
+    fn hit(&self, origin: DVec3, ray: DVec3) -> Option<Hit> {
         let grid = &self.grid;
         // In voxels, with integers at their centres.
         let from = (origin - grid.origin) / grid.voxel - 0.5;
@@ -171,7 +312,8 @@ impl Hull {
         let normal = -DVec3::new(slope(DVec3::X), slope(DVec3::Y), slope(DVec3::Z)).try_normalize()?;
         let cell = (at + 0.5).floor().max(DVec3::ZERO).to_array();
         let cell = [0, 1, 2].map(|axis| (cell[axis] as usize).min(self.grid.dims[axis] - 1));
-        Some(Hit { cell: self.grid.index(cell) as u32, normal, facing: -normal.dot(direction) })
+        let place = self.grid.origin + self.grid.voxel * (at + 0.5);
+        Some(Hit { cell: self.grid.index(cell) as u32, normal, facing: -normal.dot(direction), place })
     }
 
     /// The field between the centres of voxels.
@@ -193,6 +335,11 @@ impl Hull {
         let (a, b) = (plane(base), plane(base + along_x));
         a + share.x * (b - a)
     }
+}
+
+/// Volume of rings, up to a factor.
+fn volume_of(rings: &BTreeMap<i64, i64>) -> i64 {
+    rings.values().map(|out| out * out).sum()
 }
 
 /// Occupancy smoothed by a Gaussian of one voxel.

@@ -20,8 +20,8 @@ use super::super::view::ObjectView;
 use super::compare::compared;
 use super::evidence::{Evidence, Look};
 use super::folds::FEWEST;
-use super::hull::{Course, Grid, Hit, Hull};
-use super::layered::layered;
+use super::hull::{Course, Hit, Hull, voxel};
+use super::layered::{Cells, layered};
 use super::shaded::shaded;
 
 /// Standard errors by which a hypothesis must beat another.
@@ -33,15 +33,6 @@ pub(super) const APART: f64 = 30.0 / 180.0 * std::f64::consts::PI;
 
 /// Cosine at which a surface is seen too flat to be compared.
 pub(super) const GRAZING: f64 = 0.3;
-
-/// Edge of a voxel, in pixels at the distance of the object: cells of paint are as fine as what is seen of them. Most
-/// voxels along an object, and edge of those of a first rough hull, of its size.
-const VOXEL: f64 = 1.5;
-const MOST_ALONG: f64 = 64.0;
-const ROUGH: f64 = 0.12;
-
-/// Reach of the first hull, in sizes of the object.
-const REACH: f64 = 1.3;
 
 /// Volume of a hull, of the largest, below which a hypothesis contradicts the outlines.
 const LEAST_VOLUME: f64 = 1.0 / 3.0;
@@ -97,7 +88,7 @@ pub(super) struct Judge<'a> {
     size: f64,
     voxel: f64,
     /// Cells of the layer of light by pixel, and their number.
-    light: (Vec<Option<u32>>, usize),
+    light: Cells,
     courses: Vec<Course>,
     residuals: Vec<Residuals>,
 }
@@ -107,13 +98,7 @@ impl<'a> Judge<'a> {
     /// which it does not turn; `None` where the views are too few.
     pub(super) fn new(views: &'a [ObjectView], size: f64, unturned: Course) -> Option<Self> {
         let evidence = Evidence::of(views.iter().filter(|view| view.is_reliable()))?;
-        let footprint = |look: &Look<'_>| {
-            let pose = unturned.get(&look.view.time_index)?;
-            Some(look.footprint * (pose.translation - look.view.camera.centre()).length())
-        };
-        let mut footprints: Vec<f64> = evidence.looks.iter().filter_map(footprint).collect();
-        let voxel = VOXEL * cif_geometry::stats::median(&mut footprints)?;
-        let voxel = voxel.max(2.0 * REACH * size / MOST_ALONG);
+        let voxel = voxel(&evidence, size, &unturned)?;
         let mut judge = Self {
             evidence,
             size,
@@ -176,20 +161,15 @@ impl<'a> Judge<'a> {
 
     /// Hull of a hypothesis, and what pixels see of it.
     fn seen(&self, course: &Course) -> (Hull, Vec<Option<Hit>>) {
-        let views: Vec<&ObjectView> = self.evidence.looks.iter().map(|look| look.view).collect();
-        let reach = DVec3::splat(REACH * self.size);
-        let rough = Grid::over(-reach, reach, ROUGH * self.size);
-        let bounds = Hull::carved(rough, &views, course).bounds().unwrap_or((DVec3::ZERO, DVec3::ZERO));
-        let margin = DVec3::splat(0.5 * ROUGH * self.size);
-        let grid = Grid::over(bounds.0 - margin, bounds.1 + margin, self.voxel);
-        let hull = Hull::carved(grid, &views, course);
+        let hull = Hull::of(&self.evidence, (self.size, self.voxel), course);
         let hits = hits(&self.evidence, &hull, course);
         (hull, hits)
     }
 
     fn residuals_of(&self, course: &Course, (hull, hits): (&Hull, &[Option<Hit>]), turns: bool) -> Residuals {
+        let paint = hits.iter().map(|hit| hit.map(|hit| hit.cell)).collect();
         Residuals {
-            layered: layered(&self.evidence, (hits, hull.cells()), &self.light, turns),
+            layered: layered(&self.evidence, &(paint, hull.cells()), &self.light, turns),
             shaded: shaded(&self.evidence, (hits, hull.cells()), course),
             volume: hull.volume(),
         }
@@ -204,9 +184,8 @@ fn hits(evidence: &Evidence<'_>, hull: &Hull, course: &Course) -> Vec<Option<Hit
             found.extend(look.pixels.iter().map(|_| None));
             continue;
         };
-        let back = pose.rotation.inverse();
-        let origin = back * (look.view.camera.centre() - pose.translation);
-        let hit = |ray: DVec3| hull.hit(origin, back * ray).filter(|hit| hit.facing > GRAZING);
+        let origin = look.view.camera.centre();
+        let hit = |ray: DVec3| hull.met(pose, origin, ray).filter(|hit| hit.facing > GRAZING);
         found.extend(look.pixels.iter().map(|pixel| hit(pixel.ray)));
     }
     found
@@ -214,7 +193,7 @@ fn hits(evidence: &Evidence<'_>, hull: &Hull, course: &Course) -> Vec<Option<Hit
 
 /// Cells of the layer of light by pixel: voxels of the hull without turns, of each camera apart where several stay in
 /// place, since highlights move with them. All pixels share one where that hull is hardly hit.
-fn light_cells(evidence: &Evidence<'_>, hull: &Hull, hits: &[Option<Hit>]) -> (Vec<Option<u32>>, usize) {
+fn light_cells(evidence: &Evidence<'_>, hull: &Hull, hits: &[Option<Hit>]) -> Cells {
     let cameras = evidence.looks.iter().map(|look| look.camera).max().unwrap_or(0) + 1;
     if hits.iter().flatten().count() < FEWEST {
         return (vec![Some(0); hits.len()], 1);

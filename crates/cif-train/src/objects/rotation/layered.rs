@@ -4,10 +4,12 @@ use glam::DVec3;
 
 use super::evidence::Evidence;
 use super::folds::{FEWEST, FOLDS, OBSERVED, folds, numbered};
-use super::hull::Hit;
 
 /// Sweeps of back-fitting of the layers.
 const SWEEPS: usize = 5;
+
+/// Cells of a layer by pixel, and their number.
+pub(super) type Cells = (Vec<Option<u32>>, usize);
 
 /// A pixel that a model predicts.
 pub(super) struct Observation {
@@ -22,17 +24,17 @@ pub(super) struct Observation {
 /// Absolute residuals of the layered model on left-out pixels, each layer shrunk by one pseudo-observation per cell.
 pub(super) fn layered(
     evidence: &Evidence<'_>,
-    (hits, cells): (&[Option<Hit>], usize),
-    (light, light_cells): &(Vec<Option<u32>>, usize),
+    (paint, cells): &Cells,
+    (light, light_cells): &Cells,
     turns: bool,
 ) -> Vec<f32> {
-    let mut found = vec![f32::NAN; hits.len()];
+    let mut found = vec![f32::NAN; paint.len()];
     let mut seen = Vec::new();
     let mut pixel = 0;
     for (look, shown) in evidence.looks.iter().enumerate() {
         for value in shown.pixels.iter().map(|pixel| pixel.value) {
-            if let (Some(hit), Some(light)) = (hits[pixel], light[pixel]) {
-                let (paint, light) = (hit.cell as usize, light as usize);
+            if let (Some(paint), Some(light)) = (paint[pixel], light[pixel]) {
+                let (paint, light) = (paint as usize, light as usize);
                 seen.push(Observation { pixel, look, paint, light, value });
             }
             pixel += 1;
@@ -41,7 +43,7 @@ pub(super) fn layered(
     if seen.len() < FEWEST {
         return found;
     }
-    let cells = numbered(seen.iter_mut().map(|o| &mut o.paint), cells);
+    let cells = numbered(seen.iter_mut().map(|o| &mut o.paint), *cells);
     let lights = numbered(seen.iter_mut().map(|o| &mut o.light), *light_cells);
     let folds = folds(evidence);
     let views = evidence.looks.len();

@@ -5,7 +5,8 @@
 //! | `evidence` | which pixels judge |
 //! | `hull` | the shape of an object under a hypothesis, and what pixels see of it |
 //! | `judge` | which rotation they show, and whether they do |
-//! | `turning` | how a ball turns that stays in place |
+//! | `turning`, `revolved` | how a ball turns that stays in place, and a solid of revolution that rolls |
+//! | `painted` | which turns of a surface its paint shows |
 //! | `layered`, `shaded` | how well paint and light explain pixels left out |
 //! | `folds`, `compare` | which pixels are left out, and by how many standard errors one hypothesis is better |
 
@@ -15,6 +16,8 @@ mod folds;
 mod hull;
 mod judge;
 mod layered;
+mod painted;
+mod revolved;
 mod shaded;
 #[cfg(test)]
 mod tests;
@@ -22,4 +25,5 @@ mod turning;
 
 pub(super) use self::hull::Course;
 pub(super) use self::judge::{Shown, shown};
+pub(super) use self::revolved::Revolving;
 pub(super) use self::turning::{Ball, Turning, turning};

@@ -8,6 +8,7 @@ use super::super::shape::Pose;
 use super::super::testing::{Cameras, TIMES, jumping, moving, patches, rig, solid, sphere_places, views};
 use super::Course;
 use super::judge::{Judge, Shown, Verdict, shown};
+use super::revolved::Revolving;
 
 const RADIUS: f64 = 0.06;
 
@@ -105,4 +106,82 @@ fn shading_of_a_plain_ball_that_rolls_is_told_from_a_turn() {
     assert_eq!(of(patches, 0.0), None);
     assert_ne!(of(|_| [0.7, 0.5, 0.3], whole), Some(Shown::Turn));
     assert_ne!(of(|_| [0.7, 0.5, 0.3], 0.0), Some(Shown::Turn));
+}
+
+/// Size of the Gaussians of a cylinder.
+const SPLAT: f64 = 0.0015;
+
+/// Places on a cylinder of this length along the x axis.
+fn cylinder(length: f64, radius: f64) -> Vec<DVec3> {
+    let around = move |k: usize, radius: f64| {
+        let angle = k as f64 / 60.0 * 2.0 * PI;
+        DVec3::new(0.0, radius * angle.cos(), radius * angle.sin())
+    };
+    let ring = move |along: f64, radius: f64| (0..60).map(move |k| DVec3::X * along + around(k, radius));
+    let side = (0..=60).flat_map(move |k| ring(length * (f64::from(k) / 60.0 - 0.5), radius));
+    let ends = [0.2, 0.4, 0.6, 0.8]
+        .into_iter()
+        .flat_map(move |share| ring(-0.5 * length, share * radius).chain(ring(0.5 * length, share * radius)));
+    side.chain(ends).collect()
+}
+
+/// Views of a cylinder that moves across its axis and turns by so much of rolling without slip, its course without turns,
+/// and these turns, radians.
+fn rolled_cylinder(
+    slips: f64,
+    color: fn(DVec3) -> [f32; 3],
+    cameras: Cameras,
+) -> (Vec<super::super::view::ObjectView>, Course, Vec<f64>) {
+    let radius = 0.022;
+    let place = |time: usize| DVec3::new(0.0, 0.2 * share(time) - 0.1, radius);
+    let turns: Vec<f64> = (0..TIMES).map(|time| -slips * 0.2 * share(time) / radius).collect();
+    let truth: Vec<(DQuat, DVec3)> =
+        turns.iter().enumerate().map(|(time, turn)| (DQuat::from_rotation_x(*turn), place(time))).collect();
+    let views = views(solid(&cylinder(0.16, radius - SPLAT), color, SPLAT as f32), &truth, cameras);
+    (views, course(0.0, DVec3::X, place), turns)
+}
+
+/// Turns of a course about the x axis, radians, each near that of another.
+fn about_x(course: &Course, near: &[f64]) -> Vec<f64> {
+    let turn = |(pose, near): (&Pose, &f64)| {
+        let turn = 2.0 * pose.rotation.x.atan2(pose.rotation.w);
+        turn + ((near - turn) / (2.0 * PI)).round() * 2.0 * PI
+    };
+    course.values().zip(near).map(turn).collect()
+}
+
+/// Mean error of the turns that are found, radians; both are relative to the first.
+fn rolled_error(slips: f64, color: fn(DVec3) -> [f32; 3], cameras: Cameras) -> f64 {
+    let (seen, course, truth) = rolled_cylinder(slips, color, cameras);
+    let revolving = Revolving::new(seen.iter(), 0.08, &course, (DVec3::Z, Some(0.022))).unwrap();
+    let found = about_x(&revolving.rolled(-DVec3::X).unwrap(), &truth);
+    let error = |(turn, truth): (&f64, &f64)| (turn - found[0] - truth).abs();
+    found.iter().zip(&truth).map(error).sum::<f64>() / TIMES as f64
+}
+
+#[test]
+fn what_rolls_on_its_side_shows_how_far_by_its_paint() {
+    for (cameras, slips) in [(moving as Cameras, 1.0), (rig as Cameras, 1.0), (jumping as Cameras, 0.93)] {
+        let error = rolled_error(slips, patches, cameras);
+        assert!(error < 0.2, "{slips}: {error}");
+    }
+    // Without paint its radius tells, which is known to a voxel.
+    let plain = rolled_error(1.0, |_| [0.7, 0.5, 0.3], rig);
+    assert!(plain < 1.0, "{plain} of 10 radians");
+}
+
+#[test]
+fn what_lies_is_a_solid_of_revolution_about_no_upright_axis() {
+    let (seen, course, _) = rolled_cylinder(1.0, patches, moving);
+    let revolving = Revolving::new(seen.iter(), 0.08, &course, (DVec3::Z, None)).unwrap();
+    let [lying, upright] = [-DVec3::X, DVec3::Z].map(|axis| revolving.covered(axis));
+    assert!(lying > 0.85 && upright < 0.5, "{lying}, {upright}");
+    // What stands is none about an axis across its way.
+    let place = |time: usize| DVec3::new(0.0, 0.2 * share(time) - 0.1, 0.08);
+    let course = self::course(0.0, DVec3::Z, place);
+    let standing: Vec<DVec3> = cylinder(0.16, 0.03).iter().map(|p| DVec3::new(p.z, p.y, p.x)).collect();
+    let seen = views(solid(&standing, patches, 0.003), &poses(&course), moving);
+    let revolving = Revolving::new(seen.iter(), 0.08, &course, (DVec3::Z, None)).unwrap();
+    let [lying, upright] = [-DVec3::X, DVec3::Z].map(|axis| revolving.covered(axis));
+    assert!(upright > 0.85 && lying < 0.7, "{lying}, {upright}");
 }
