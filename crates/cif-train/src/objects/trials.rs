@@ -226,7 +226,8 @@ pub(super) fn best_way<'a>(
     let unturned = simple_errors[1];
     let is_turned = rotation == RotationEvidence::Observed;
     let rotation = if contest.shows(&fit.poses) { rotation } else { RotationEvidence::Assumed };
-    let error = losses[1];
+    // Light, which stays where it is, argues against rolling: how rigid it is shows where it does not turn, too.
+    let error = unturned.filter(|_| way == Way::Lies).map_or(losses[1], |unturned| unturned.min(losses[1]));
     Ok(Some(Started { fit, path, way, rotation, is_turned, error, unturned, bent, reference }))
 }
 
@@ -262,7 +263,6 @@ impl<'a> Contest<'a> {
         self.advance(&mut trials, (0, STEPS[1]), false)?;
         self.judge(&mut trials, false);
         let least = simple.iter().map(|trial| trial.losses[1]).fold(f64::INFINITY, f64::min);
-        // Light, which stays where it is, argues against rolling.
         let is_kept = |error: f64| way == Way::Lies || error <= TEXTURE_GAIN * least;
         Ok(trials.pop().filter(|trial| is_kept(trial.losses[1])))
     }

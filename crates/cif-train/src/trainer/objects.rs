@@ -67,9 +67,7 @@ pub(super) fn is_rigid(fitted: &Fitted, most: f64) -> bool {
     let explains = |unturned: f64| fitted.is_turned && fitted.error <= TURN_EXPLAINS * unturned;
     let bends_no_better = |bent: f64| bent >= BENDS_NO_BETTER && fitted.error <= ROUGH * most;
     let deforms = !fitted.is_ball && fitted.bent.is_some_and(|bent| bent <= DEFORMS);
-    // What rolls on its side looks more alike where it does not turn, as light does not.
-    let least = fitted.unturned.map_or(fitted.error, |unturned| unturned.min(fitted.error));
-    let is_explained = least <= most
+    let is_explained = fitted.error <= most
         || fitted.unturned.is_some_and(explains)
         || (!fitted.is_settled && fitted.bent.is_some_and(bends_no_better));
     is_explained && !deforms

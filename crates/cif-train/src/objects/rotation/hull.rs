@@ -146,7 +146,7 @@ impl Hull {
     }
 
     /// Middle of what is inside; `None` where there is nothing.
-    pub(super) fn middle(&self) -> Option<DVec3> {
+    fn middle(&self) -> Option<DVec3> {
         let full = self.grid.places().filter(|at| self.inside[self.grid.index(*at)]);
         let (sum, count) =
             full.fold((DVec3::ZERO, 0.0), |(sum, n), at| (sum + self.grid.centre(at), n + 1.0));
@@ -154,7 +154,7 @@ impl Hull {
     }
 
     /// Carves a grid by the masks of views whose times have poses; pixels of what may hide the object say nothing.
-    pub(super) fn carved(grid: Grid, views: &[&ObjectView], poses: &Course) -> Self {
+    fn carved(grid: Grid, views: &[&ObjectView], poses: &Course) -> Self {
         let posed: Vec<(&ObjectView, &Pose)> =
             views.iter().filter_map(|view| Some((*view, poses.get(&view.time_index)?))).collect();
         let looked: Vec<&(&ObjectView, &Pose)> =

@@ -21,7 +21,7 @@ use super::compare::compared;
 use super::evidence::{Evidence, Look};
 use super::folds::FEWEST;
 use super::hull::{Course, Hit, Hull, voxel};
-use super::layered::{Cells, layered};
+use super::layered::{LayerCells, layered};
 use super::shaded::shaded;
 
 /// Standard errors by which a hypothesis must beat another.
@@ -88,7 +88,7 @@ pub(super) struct Judge<'a> {
     size: f64,
     voxel: f64,
     /// Cells of the layer of light by pixel, and their number.
-    light: Cells,
+    light: LayerCells,
     courses: Vec<Course>,
     residuals: Vec<Residuals>,
 }
@@ -193,7 +193,7 @@ fn hits(evidence: &Evidence<'_>, hull: &Hull, course: &Course) -> Vec<Option<Hit
 
 /// Cells of the layer of light by pixel: voxels of the hull without turns, of each camera apart where several stay in
 /// place, since highlights move with them. All pixels share one where that hull is hardly hit.
-fn light_cells(evidence: &Evidence<'_>, hull: &Hull, hits: &[Option<Hit>]) -> Cells {
+fn light_cells(evidence: &Evidence<'_>, hull: &Hull, hits: &[Option<Hit>]) -> LayerCells {
     let cameras = evidence.looks.iter().map(|look| look.camera).max().unwrap_or(0) + 1;
     if hits.iter().flatten().count() < FEWEST {
         return (vec![Some(0); hits.len()], 1);

@@ -9,7 +9,7 @@ use super::folds::{FEWEST, FOLDS, OBSERVED, folds, numbered};
 const SWEEPS: usize = 5;
 
 /// Cells of a layer by pixel, and their number.
-pub(super) type Cells = (Vec<Option<u32>>, usize);
+pub(super) type LayerCells = (Vec<Option<u32>>, usize);
 
 /// A pixel that a model predicts.
 pub(super) struct Observation {
@@ -24,8 +24,8 @@ pub(super) struct Observation {
 /// Absolute residuals of the layered model on left-out pixels, each layer shrunk by one pseudo-observation per cell.
 pub(super) fn layered(
     evidence: &Evidence<'_>,
-    (paint, cells): &Cells,
-    (light, light_cells): &Cells,
+    (paint, cells): &LayerCells,
+    (light, light_cells): &LayerCells,
     turns: bool,
 ) -> Vec<f32> {
     let mut found = vec![f32::NAN; paint.len()];

@@ -45,7 +45,8 @@ const CAP: f64 = 4.0;
 const FASTEST: f64 = 0.8;
 const STEP: f64 = 0.05;
 
-/// Angle from turns that are expected up to which others are looked for, radians.
+/// Angle from turns that are expected up to which others are looked for, radians: what a radius that is off by a twentieth
+/// makes of a whole turn.
 const NEAR: f64 = 0.35;
 
 /// Angles by which the axis is moved, radians.
@@ -164,15 +165,15 @@ struct Spot {
 #[derive(Clone)]
 pub(super) struct Seen {
     cells: Cells,
-    pub(super) cameras: usize,
+    cameras: usize,
     spots: Vec<Spot>,
     /// Ranges of the spots of views, the places of their times, and these times.
     ranges: Vec<std::ops::Range<usize>>,
     time_of: Vec<usize>,
-    pub(super) times: Vec<usize>,
+    times: Vec<usize>,
     /// Error of every spot with light alone, which is what paint that no other time shows predicts, and their mean.
     alone: Vec<f64>,
-    pub(super) error: f64,
+    error: f64,
 }
 
 /// Turns about an axis at all times, and what they cost.
@@ -185,7 +186,7 @@ pub(super) struct Turned {
 
 impl Turned {
     /// Difference of the largest and the least angle.
-    pub(super) fn reach(&self) -> f64 {
+    fn reach(&self) -> f64 {
         let ends = |(low, high): (f64, f64), angle: &f64| (low.min(*angle), high.max(*angle));
         let (low, high) = self.angles.iter().fold((f64::INFINITY, f64::NEG_INFINITY), ends);
         high - low
@@ -194,7 +195,7 @@ impl Turned {
 
 impl Seen {
     /// Places that pixels show, seen at a cosine.
-    pub(super) fn of(
+    fn of(
         evidence: &Evidence<'_>,
         cells: Cells,
         place: impl Fn(&Look<'_>, &Pixel) -> Option<(DVec3, f64)>,
@@ -225,7 +226,7 @@ impl Seen {
 
     /// The same of at most so many pixels of each view, with the residuals that light alone leaves of all; `None` where it
     /// predicts none.
-    pub(super) fn few(&self, most: usize, still: &[f32]) -> Option<Self> {
+    fn few(&self, most: usize, still: &[f32]) -> Option<Self> {
         let error = mean(still)?;
         let mut few = Self { error, spots: Vec::new(), ranges: Vec::new(), ..self.clone() };
         for range in &self.ranges {
@@ -241,7 +242,7 @@ impl Seen {
     }
 
     /// No turns at any time.
-    pub(super) fn still(&self) -> Turned {
+    fn still(&self) -> Turned {
         Turned { axis: DVec3::Z, angles: vec![0.0; self.times.len()], cost: 0.0 }
     }
 
@@ -272,7 +273,7 @@ impl Seen {
     }
 
     /// Residuals of all pixels that are left out, by the layered model.
-    pub(super) fn residuals(&self, evidence: &Evidence<'_>, turned: &Turned, turns: bool) -> Vec<f32> {
+    fn residuals(&self, evidence: &Evidence<'_>, turned: &Turned, turns: bool) -> Vec<f32> {
         let painted = self.painted(turned.axis);
         let mut paint = vec![None; evidence.len()];
         let mut light = vec![None; evidence.len()];
