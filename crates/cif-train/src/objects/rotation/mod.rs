@@ -25,5 +25,6 @@ mod turning;
 
 pub(super) use self::hull::Course;
 pub(super) use self::judge::{Shown, shown};
+pub(super) use self::painted::Turning;
 pub(super) use self::revolved::Revolving;
-pub(super) use self::turning::{Ball, Turning, turning};
+pub(super) use self::turning::{Ball, turning};

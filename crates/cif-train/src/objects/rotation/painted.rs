@@ -12,7 +12,6 @@ use super::compare::{gains, standard_errors};
 use super::evidence::{Evidence, Look, Pixel};
 use super::judge::{APART, GRAZING, SIGMAS};
 use super::layered::{Layers, Observation, layered};
-use super::turning::Turning;
 
 /// Pixels of a view that are looked at.
 const PIXELS: usize = 400;
@@ -51,6 +50,17 @@ const NEAR: f64 = 0.35;
 
 /// Angles by which the axis is moved, radians.
 const MOVED: [f64; 3] = [PI / 18.0, PI / 36.0, PI / 72.0];
+
+/// How something turns.
+#[derive(Clone, Debug)]
+pub(in super::super) struct Turning {
+    /// Unit, in the frame of the course without turns: the world, of a ball in place.
+    pub(in super::super) axis: DVec3,
+    /// Radians about it by time.
+    pub(in super::super) angles: BTreeMap<usize, f64>,
+    /// Mean residuals of pixels left out: with the turns, and by light alone.
+    pub(in super::super) errors: [f64; 2],
+}
 
 /// What pixels show of a surface, and how well it is explained where nothing turns.
 pub(super) struct Shown {

@@ -8,8 +8,7 @@ use super::super::view::ObjectView;
 use super::evidence::{Evidence, Look, Pixel};
 use super::hull::{Contact, Course, Hull, voxel};
 use super::judge::SIGMAS;
-use super::painted::{Cells, Shown};
-use super::turning::Turning;
+use super::painted::{Cells, Shown, Turning};
 
 /// Times that the hull is carved again with the turns that were found: views of all sides show what few of one do not.
 const CARVED: usize = 3;

@@ -2,14 +2,12 @@
 //! shows the turns. Of axes all around, the turns about each are found under which light that stays and paint that turns
 //! explain all times together.
 
-use std::collections::BTreeMap;
-
 use glam::DVec3;
 use rayon::prelude::*;
 
 use super::super::view::ObjectView;
 use super::evidence::{Evidence, Look, Pixel};
-use super::painted::{Cells, Shown, Turned, hemisphere};
+use super::painted::{Cells, Shown, Turned, Turning, hemisphere};
 
 /// Axes that are tried of a ball, about 23 degrees apart, and those that are tried further.
 const AXES: usize = 40;
@@ -23,17 +21,6 @@ const ROWS: f64 = 24.0;
 pub(in super::super) struct Ball {
     pub(in super::super) centre: DVec3,
     pub(in super::super) radius: f64,
-}
-
-/// How something turns.
-#[derive(Clone, Debug)]
-pub(in super::super) struct Turning {
-    /// Unit, in the frame of the course without turns: the world, of a ball in place.
-    pub(in super::super) axis: DVec3,
-    /// Radians about it by time.
-    pub(in super::super) angles: BTreeMap<usize, f64>,
-    /// Mean residuals of pixels left out: with the turns, and by light alone.
-    pub(in super::super) errors: [f64; 2],
 }
 
 /// The turns of a ball in place that its views (in the order of times) show; `None` where they show none of more than 30
