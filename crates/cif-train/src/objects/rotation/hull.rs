@@ -276,7 +276,7 @@ impl Hull {
         self.grid.len()
     }
 
-    /// What a ray in the world meets of the object in a pose; `None` where it passes by.
+    /// The point of the object in a pose that a ray in the world meets; `None` where it passes by.
     pub(super) fn met(&self, pose: &Pose, origin: DVec3, ray: DVec3) -> Option<Hit> {
         let back = pose.rotation.inverse();
         self.hit(back * (origin - pose.translation), back * ray)

@@ -62,7 +62,7 @@ pub(in super::super) struct Turning {
     pub(in super::super) errors: [f64; 2],
 }
 
-/// What pixels show of a surface, and how well it is explained where nothing turns.
+/// Places of a surface that pixels show, and how well they are explained where nothing turns.
 pub(super) struct Shown {
     all: Seen,
     /// Places that a few pixels of each view show.
@@ -71,7 +71,7 @@ pub(super) struct Shown {
 }
 
 impl Shown {
-    /// What pixels show at places from the middle of the axis, in the frame in which the surface turns, seen at a cosine;
+    /// Places that pixels show, from the middle of the axis, in the frame in which the surface turns, seen at a cosine;
     /// `None` where there is too little.
     pub(super) fn of(
         evidence: &Evidence<'_>,

@@ -111,7 +111,7 @@ impl Solid<'_, '_> {
         self.hull.radius_about(axis, self.middle)
     }
 
-    /// What pixels show of the solid, or of the hull that is carved with some turns.
+    /// Places that pixels show of the solid, or of the hull that is carved with some turns.
     fn shown(&self, turning: Option<&Turning>) -> Option<Shown> {
         let Revolving { evidence, size, voxel, course, .. } = self.of;
         let carved =
