@@ -23,7 +23,7 @@ const SMALLEST: f64 = 8.0;
 const DRAWN: usize = 200;
 
 /// Distance of the outline of a mask from a circle, pixels and of its radius, up to which it is that of the circle; the
-/// directions from its middle that are told apart, and the share of these in which it must be.
+/// directions from its middle that are distinguished, and the share of these in which it must be.
 const NEAR: [f64; 2] = [0.6, 0.02];
 const SIDES: usize = 32;
 const OUTLINED: f64 = 0.5;

@@ -1,6 +1,6 @@
 //! Turns of an object about the upright axis, as several cameras see it, read from its texture: solids of revolution, whose
 //! outline is the same from all sides, show them by nothing else. The surface is unrolled from a cylinder at every time;
-//! what stays in place between times is light, and what moves around tells the turn.
+//! what stays in place between times is light, and what moves around shows the turn.
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;

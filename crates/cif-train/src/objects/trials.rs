@@ -72,7 +72,7 @@ const FOLLOW_GAIN: [f64; 2] = [0.98, 0.85];
 const STRAINED: f64 = 1.15;
 const OFF_GAIN: f64 = 0.85;
 
-/// Largest error of turning as texture tells, relative to the best other way: a few Gaussians without texture prefer no
+/// Largest error of turning as texture shows, relative to the best other way: a few Gaussians without texture prefer no
 /// turn.
 const TEXTURE_GAIN: f64 = 1.3;
 
@@ -251,7 +251,7 @@ impl<'a> Contest<'a> {
         Ok(trials)
     }
 
-    /// Turning as texture tells, where it does and the outline says nothing else, or rolling of what lies on its side.
+    /// Turning as texture shows, where it does and the outline says nothing else, or rolling of what lies on its side.
     fn textured(
         &mut self,
         simple: &[Trial<'_>],
@@ -267,7 +267,7 @@ impl<'a> Contest<'a> {
         Ok(trials.pop().filter(|trial| is_kept(trial.losses[1])))
     }
 
-    /// Poses of rolling of what lies, or with turns that its texture tells.
+    /// Poses of rolling of what lies, or with turns that its texture shows.
     fn turned(
         &self,
         simple: &[Trial<'_>],
@@ -275,7 +275,7 @@ impl<'a> Contest<'a> {
     ) -> Option<(Way, BTreeMap<usize, Pose>)> {
         let (outline, paths) = (self.object.outline, &self.paths);
         let seen: Vec<&ObjectView> = reliable.iter().map(|view| &self.object.views[*view]).collect();
-        if let Some(lying) = self.lying(simple, &seen).filter(|_| !stays) {
+        if !stays && let Some(lying) = self.lying(simple, &seen) {
             return Some((Way::Lies, lying));
         }
         let mut turns = texture::turns(seen.iter().copied(), &paths.along, outline, paths.up);

@@ -48,7 +48,7 @@ pub(super) enum Way {
     Roll(f64),
     /// As following it from time to time found.
     Followed,
-    /// Along the path, turning as its texture tells.
+    /// Along the path, turning as its texture shows.
     Textured,
     /// Along the path, rolling about an axis that lies across it.
     Lies,
@@ -94,7 +94,7 @@ pub(super) struct Paths<'a> {
     pub(super) followed: Option<BTreeMap<usize, Pose>>,
     /// Times at which it may be off its support in these.
     pub(super) off: Vec<usize>,
-    /// Poses with turns that its texture tells, or of rolling on its side.
+    /// Poses with turns that its texture shows, or of rolling on its side.
     pub(super) turned: Option<BTreeMap<usize, Pose>>,
 }
 

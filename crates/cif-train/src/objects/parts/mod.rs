@@ -86,7 +86,7 @@ pub(super) fn turning_ball(object: Object<'_>) -> Result<Option<Jointed>, TrainE
     let shown = || object.views.iter().filter(|view| !view.is_sliver());
     let Some(ball) = discs::ball(shown()) else { return Ok(None) };
     phases.check()?;
-    let Some(Turning { axis, angles, errors }) = turning(shown(), &ball) else { return Ok(None) };
+    let Some((Turning { axis, angles }, errors)) = turning(shown(), &ball) else { return Ok(None) };
     phases.check()?;
     let rests = Pose { rotation: DQuat::IDENTITY, translation: ball.centre };
     let base: BTreeMap<usize, Pose> = object.views.iter().map(|view| (view.time_index, rests)).collect();

@@ -58,8 +58,6 @@ pub(in super::super) struct Turning {
     pub(in super::super) axis: DVec3,
     /// Radians about it by time.
     pub(in super::super) angles: BTreeMap<usize, f64>,
-    /// Mean residuals of pixels left out: with the turns, and by light alone.
-    pub(in super::super) errors: [f64; 2],
 }
 
 /// Places of a surface that pixels show, and how well they are explained where nothing turns.
@@ -97,14 +95,19 @@ impl Shown {
         Turned { axis, angles: self.all.times.iter().map(angle).collect(), cost: 0.0 }
     }
 
-    /// Turns that were found as angles by time, and whether the pictures show them.
-    pub(super) fn turning(&self, evidence: &Evidence<'_>, found: &Turned) -> Option<(Turning, bool)> {
+    /// Turns that were found as angles by time.
+    pub(super) fn turning(&self, found: &Turned) -> Turning {
+        let angles = self.all.times.iter().copied().zip(found.angles.iter().copied()).collect();
+        Turning { axis: found.axis, angles }
+    }
+
+    /// Mean residuals of pixels left out, with turns and by light alone; `None` where they do not show the turns, by more
+    /// than 30 degrees.
+    pub(super) fn errors(&self, evidence: &Evidence<'_>, found: &Turned) -> Option<[f64; 2]> {
         let residuals = self.all.residuals(evidence, found, true);
         let is_shown =
             standard_errors(&gains(evidence, &residuals, &self.still)) > SIGMAS && found.reach() > APART;
-        let angles = self.all.times.iter().copied().zip(found.angles.iter().copied()).collect();
-        let errors = [mean(&residuals)?, self.few.error];
-        Some((Turning { axis: found.axis, angles, errors }, is_shown))
+        if is_shown { Some([mean(&residuals)?, self.few.error]) } else { None }
     }
 }
 

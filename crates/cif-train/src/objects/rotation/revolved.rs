@@ -23,6 +23,7 @@ pub(in super::super) struct Revolving<'a> {
     size: f64,
     voxel: f64,
     course: &'a Course,
+    hull: Hull,
     /// Away from the support, and height of the course above it where there is one.
     up: DVec3,
     height: Option<f64>,
@@ -39,7 +40,8 @@ impl<'a> Revolving<'a> {
     ) -> Option<Self> {
         let evidence = Evidence::of(views)?;
         let voxel = voxel(&evidence, size, course)?;
-        Some(Self { evidence, size, voxel, course, up, height })
+        let hull = Hull::of(&evidence, (size, voxel), course);
+        Some(Self { evidence, size, voxel, course, hull, up, height })
     }
 
     /// Share of the pixels of the object that show the largest solid of revolution about an axis of this direction.
@@ -69,19 +71,18 @@ impl<'a> Revolving<'a> {
         let is_seen = gains[best].1 > SIGMAS;
         let expected =
             if is_seen { tried[best].clone() } else { rolled(self.solid(axis, None)?.radius(axis)) };
-        let mut found = shown.turning(&self.evidence, &expected)?.0;
+        let mut found = shown.turning(&expected);
         for _ in 0..if is_seen { CARVED } else { 0 } {
             let shown = solid.shown(Some(&found))?;
-            found = shown.turning(&self.evidence, &shown.few.painted(axis).near(&expected))?.0;
+            found = shown.turning(&shown.few.painted(axis).near(&expected));
         }
-        // Its places are those of the course, which all outlines tell.
+        // Its places are those of the course, which all outlines show.
         Some(found.about(self.course, DVec3::ZERO))
     }
 
     /// The largest solid of revolution about an axis of this direction, on a support.
     fn solid(&self, axis: DVec3, contact: Option<&Contact>) -> Option<Solid<'_, 'a>> {
-        let hull = Hull::of(&self.evidence, (self.size, self.voxel), self.course);
-        let (hull, middle) = hull.revolved(axis, contact)?;
+        let (hull, middle) = self.hull.revolved(axis, contact)?;
         Some(Solid { of: self, hull, middle })
     }
 

@@ -165,7 +165,7 @@ fn what_rolls_on_its_side_shows_how_far_by_its_paint() {
         let error = rolled_error(slips, patches, cameras);
         assert!(error < 0.2, "{slips}: {error}");
     }
-    // Without paint its radius tells, which is known to a voxel.
+    // Without paint its radius decides, which is known to a voxel.
     let plain = rolled_error(1.0, |_| [0.7, 0.5, 0.3], rig);
     assert!(plain < 1.0, "{plain} of 10 radians");
 }

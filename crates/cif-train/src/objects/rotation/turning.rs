@@ -24,11 +24,11 @@ pub(in super::super) struct Ball {
 }
 
 /// The turns of a ball in place that its views (in the order of times) show; `None` where they show none of more than 30
-/// degrees.
+/// degrees. With the mean residuals of pixels left out: with the turns, and by light alone.
 pub(in super::super) fn turning<'a>(
     views: impl Iterator<Item = &'a ObjectView>,
     ball: &Ball,
-) -> Option<Turning> {
+) -> Option<(Turning, [f64; 2])> {
     let evidence = Evidence::of(views)?;
     let place =
         |look: &Look<'_>, pixel: &Pixel| ball.outward(look.view.camera.centre(), pixel.ray.normalize());
@@ -39,8 +39,8 @@ pub(in super::super) fn turning<'a>(
     found.sort_by(|a, b| a.cost.total_cmp(&b.cost));
     let tried = found.into_par_iter().take(TRIED).map(|turned| seen.painted(turned.axis).further(turned));
     let best = tried.min_by(|a, b| a.cost.total_cmp(&b.cost))?;
-    let (turning, is_shown) = shown.turning(&evidence, &seen.finely(seen.moved(best)))?;
-    is_shown.then_some(turning)
+    let best = seen.finely(seen.moved(best));
+    Some((shown.turning(&best), shown.errors(&evidence, &best)?))
 }
 
 impl Ball {
