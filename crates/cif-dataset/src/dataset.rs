@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use cif_geometry::{Bounds, LensDistortion, PinholeCamera, PixelGrid};
+use cif_geometry::{Bounds, LensDistortion, PinholeCamera, PixelGrid, TimeWindow};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
@@ -42,6 +42,8 @@ pub struct OpenOptions {
     pub without_cameras: Vec<String>,
     /// Most frames taken of a video, from its start on; [`DEFAULT_VIDEO_FRAMES`] where `None`.
     pub video_frames: Option<u32>,
+    /// Read the frames of a window of time alone; `None` reads all.
+    pub window: Option<TimeWindow>,
 }
 
 /// Frames taken of a video unless said otherwise: as many as the published scores of Neu3D are of.
@@ -104,6 +106,17 @@ pub struct PointCloud {
     pub source: PointSource,
 }
 
+/// The part of a capture that a dataset is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CaptureWindow {
+    /// Which one.
+    pub window: TimeWindow,
+    /// Index of the first of its times among all those of the capture.
+    pub first: usize,
+    /// Its first and last time, normalised over the whole capture.
+    pub times: [f64; 2],
+}
+
 /// A capture, understood.
 #[derive(Clone, Debug)]
 pub struct Dataset {
@@ -115,6 +128,8 @@ pub struct Dataset {
     pub frames: Vec<Frame>,
     /// Distinct normalised times, ascending, of all frames.
     pub times: Vec<f64>,
+    /// The window of time that was read, of a capture that has more; `times` begin and end with it.
+    pub window: Option<CaptureWindow>,
     /// Frames per second of the capture, where it says so.
     pub frames_per_second: Option<f64>,
     /// Instances, ascending id; empty without masks.

@@ -58,11 +58,15 @@ mod recognition;
 mod sizes;
 mod summary;
 mod trained_images;
+mod window;
 
 /// Where a dataset lies in the coordinates of its capture.
 pub use cif_geometry::CaptureFrame;
+/// One of the windows of time that a long capture is divided into.
+pub use cif_geometry::TimeWindow;
 pub use dataset::{
-    DEFAULT_VIDEO_FRAMES, Dataset, Frame, FrameData, OpenOptions, PointCloud, PointSource, Split,
+    CaptureWindow, DEFAULT_VIDEO_FRAMES, Dataset, Frame, FrameData, OpenOptions, PointCloud, PointSource,
+    Split,
 };
 pub use error::Error;
 pub use feature_maps::feature_maps;

@@ -176,6 +176,29 @@ impl MotionTruth {
         Ok(())
     }
 
+    /// The motion of a window of time, given by its ends, which become 0 and 1.
+    fn during(self, [first, last]: [f64; 2]) -> Self {
+        let kept: Vec<usize> = (0..self.times.len())
+            .filter(|step| (first - SAME_TIME..=last + SAME_TIME).contains(&self.times[*step]))
+            .collect();
+        fn of<T: Clone>(values: &[T], kept: &[usize]) -> Vec<T> {
+            kept.iter().map(|step| values[*step].clone()).collect()
+        }
+        let instances = self.instances.into_iter().map(|(id, motion)| {
+            let of_window = TrueMotion {
+                world_from_object: of(&motion.world_from_object, &kept),
+                boxes: of(&motion.boxes, &kept),
+                points: motion.points.iter().map(|track| of(track, &kept)).collect(),
+                ..motion
+            };
+            (id, of_window)
+        });
+        Self {
+            times: kept.iter().map(|step| (self.times[*step] - first) / (last - first)).collect(),
+            instances: instances.collect(),
+        }
+    }
+
     /// Steps at which some mask of the capture, as stored, shows at least [`LEAST_SEEN_PIXELS`] of an instance,
     /// ascending, by mask id. Nobody can know the motion at others. Decodes every mask.
     ///
@@ -229,6 +252,9 @@ impl Dataset {
         let Some([motion, tracks]) = self.motion_files() else { return Ok(None) };
         let mut truth = MotionTruth::read(&motion)?;
         truth.add_tracks(&tracks)?;
+        if let Some(window) = &self.window {
+            truth = truth.during(window.times);
+        }
         Ok(Some(truth))
     }
 }

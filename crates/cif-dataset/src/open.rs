@@ -57,6 +57,7 @@ impl Dataset {
             layout,
             frames,
             times,
+            window: None,
             frames_per_second: draft.frames_per_second.filter(|rate| rate.is_finite() && *rate > 0.0),
             instances: Vec::new(),
             mask_objects: cryptomatte::ObjectIds::new(),
@@ -90,7 +91,10 @@ impl Dataset {
         }
         dataset.points = dataset.initial_points(draft.points, draft.random_box)?;
         dataset.warnings.extend(points::unseen_warning(&dataset));
-        Ok(dataset)
+        match options.window {
+            Some(window) => dataset.during(window),
+            None => Ok(dataset),
+        }
     }
 
     /// The same capture with the masks of another folder (a name inside the capture, or a path) and the

@@ -4,7 +4,7 @@ mod support;
 
 use std::path::Path;
 
-use cif_dataset::{Dataset, Layout, OpenOptions, PointSource, Split};
+use cif_dataset::{Dataset, Frame, Layout, OpenOptions, PointSource, Split};
 use glam::{DVec2, DVec3};
 use serde_json::json;
 use support::*;
@@ -119,6 +119,35 @@ fn the_principal_point_can_be_centred() {
     let options = OpenOptions { centre_principal_point: true, ..OpenOptions::default() };
     let dataset = Dataset::open(folder.path(), &options).unwrap();
     assert_eq!(dataset.frames[0].camera.principal_px, DVec2::new(16.0, 12.0));
+}
+
+#[test]
+fn a_window_of_time_has_its_frames_and_the_instances_and_points_of_all() {
+    let folder = hypernerf(40);
+    let all = open(&folder);
+    let seen = |window: &str| {
+        let options = OpenOptions { window: Some(window.parse().unwrap()), ..OpenOptions::default() };
+        Dataset::open(folder.path(), &options)
+    };
+    // Nine and ten times of its own, and two of each neighbour.
+    for (window, first, last) in [("1/4", 0, 11), ("2/4", 8, 21), ("4/4", 28, 39)] {
+        let part = seen(window).unwrap();
+        let names: Vec<&str> = part.frames.iter().map(|frame| frame.name.as_str()).collect();
+        let expected: Vec<&Frame> =
+            all.frames.iter().filter(|frame| (first..=last).contains(&frame.time_index)).collect();
+        assert_eq!(names, expected.iter().map(|frame| frame.name.as_str()).collect::<Vec<_>>());
+        assert_eq!((part.times[0], part.times[part.times.len() - 1]), (0.0, 1.0));
+        for (frame, whole) in part.frames.iter().zip(&expected) {
+            assert_eq!((frame.time_index, frame.split), (whole.time_index - first, whole.split));
+            assert_eq!(part.times[frame.time_index], frame.time);
+            assert_eq!(frame.camera, whole.camera);
+        }
+        assert_eq!((&part.instances, &part.points), (&all.instances, &all.points));
+        let found = part.window.unwrap();
+        assert_eq!((found.window.to_string().as_str(), found.first), (window, first));
+    }
+    let error = seen("3/11").unwrap_err().to_string();
+    assert!(error.contains("its 40 times are too few for 11 windows; give at most 10"), "{error}");
 }
 
 #[test]

@@ -7,7 +7,7 @@
 
 use std::collections::BTreeMap;
 
-use cif_geometry::{CaptureFrame, UpAxis};
+use cif_geometry::{CaptureFrame, TimeWindow, UpAxis};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
@@ -23,10 +23,13 @@ pub struct Record {
     pub frame: CaptureFrame,
     /// Unit and up axis that the file declared that it was imported from; exports declare the same.
     pub declared: Option<Declared>,
-    /// Time codes of its frames in that file; `None` where frame `f` is time code `f`.
+    /// Time codes of its frames in that file, or in the capture that it is a window of; `None` where frame `f` is time
+    /// code `f`.
     pub frame_codes: Option<FrameCodes>,
     /// Name of the capture that it was trained on.
     pub capture: Option<String>,
+    /// Window of time of that capture; `None` for all of it.
+    pub window: Option<TimeWindow>,
     /// A sentence on what is not known of the world of that capture, its unit or its up axis; exports warn with it.
     pub unknown: Option<String>,
     /// The run that trained it.
@@ -185,6 +188,7 @@ const FRAME: &str = "frame";
 const UP_AXIS: &str = "up_axis";
 const UNIT: &str = "meters_per_unit";
 const TIME_CODES: &str = "time_codes";
+const WINDOW: &str = "window";
 const UNKNOWN: &str = "unknown";
 const EXPOSURES: &str = "exposures";
 
@@ -203,14 +207,17 @@ impl Record {
         };
         let mut record = Self { frame: take_frame(&mut notes)?, ..Self::default() };
         let capture = notes.get_mut(CAPTURE).and_then(Value::as_object_mut);
-        (record.capture, record.unknown) =
-            capture.map_or((None, None), |of| (take(of, NAME), take(of, UNKNOWN)));
+        if let Some(of) = capture {
+            (record.capture, record.unknown) = (take(of, NAME), take(of, UNKNOWN));
+            record.window = take(of, WINDOW);
+            record.frame_codes = take(of, TIME_CODES).filter(FrameCodes::is_valid);
+        }
         let imported = notes.get(IMPORTED);
         let of_file = imported.and_then(|of| serde_json::from_value::<Declared>(of.clone()).ok());
         record.declared = of_file.filter(|of| of.meters_per_unit.is_finite() && of.meters_per_unit > 0.0);
         let codes = imported.and_then(|of| of.get(TIME_CODES)).cloned();
-        record.frame_codes = codes.and_then(|codes| serde_json::from_value(codes).ok());
-        record.frame_codes = record.frame_codes.take().filter(FrameCodes::is_valid);
+        let codes = codes.and_then(|codes| serde_json::from_value(codes).ok());
+        record.frame_codes = codes.filter(FrameCodes::is_valid).or(record.frame_codes);
         if let Some(imported) = notes.get_mut(IMPORTED).and_then(Value::as_object_mut) {
             let typed = [
                 (record.declared.is_some(), &[UP_AXIS, UNIT][..]),
@@ -259,6 +266,9 @@ impl Record {
         if let Some(name) = &self.capture {
             put(CAPTURE, NAME, json!(name));
         }
+        if let Some(window) = self.window {
+            put(CAPTURE, WINDOW, json!(window));
+        }
         if let Some(sentence) = &self.unknown {
             put(CAPTURE, UNKNOWN, json!(sentence));
         }
@@ -270,7 +280,7 @@ impl Record {
             put(IMPORTED, UNIT, json!(declared.meters_per_unit));
         }
         if let Some(codes) = &self.frame_codes {
-            put(IMPORTED, TIME_CODES, json!(codes));
+            put(place, TIME_CODES, json!(codes));
         }
         let run = self.run.as_ref().map(|run| json!(run));
         let edits = (!self.edits.is_empty()).then(|| json!(self.edits));
@@ -440,6 +450,19 @@ mod tests {
             json!({ "imported": { "up_axis": "x", "meters_per_unit": -1.0, "time_codes": [2.0, 1.0] } });
         let record = Record::from_json(wrong.clone()).unwrap();
         assert_eq!((record.declared, record.frame_codes.clone()), (None, None));
+        assert_eq!(record.to_json(), wrong, "stays a note");
+    }
+
+    #[test]
+    fn windows_of_time_come_back() {
+        let json = json!({ "dataset": { "name": "walk", "window": "2/4", "time_codes": 262.0 } });
+        let record = Record::from_json(json.clone()).unwrap();
+        assert_eq!(record.window, TimeWindow::new(2, 4));
+        assert_eq!(record.frame_codes, FrameCodes::of(&[262.0, 263.0]));
+        assert_eq!(record.to_json(), json);
+        let wrong = json!({ "dataset": { "window": "5/4", "time_codes": "later" } });
+        let record = Record::from_json(wrong.clone()).unwrap();
+        assert_eq!((record.window, record.frame_codes.clone()), (None, None));
         assert_eq!(record.to_json(), wrong, "stays a note");
     }
 

@@ -11,6 +11,7 @@
 //! | [`camera`] | ideal pinhole cameras |
 //! | [`capture_frame`] | where coordinates lie in the world of a capture |
 //! | [`lens`] | lens distortion and its removal |
+//! | [`time_window`] | which times of a long capture are trained together |
 //! | [`up_axis`] | which axis of a world points up |
 //! | [`grid`] | row-major pixel grids |
 //! | [`bounds`] | axis-aligned boxes |
@@ -30,6 +31,7 @@ pub mod quaternion;
 pub mod scalar;
 pub mod spherical_harmonics;
 pub mod stats;
+pub mod time_window;
 pub mod transform;
 pub mod up_axis;
 
@@ -40,5 +42,6 @@ pub use capture_frame::CaptureFrame;
 pub use grid::PixelGrid;
 pub use lens::LensDistortion;
 pub use scalar::Real;
+pub use time_window::TimeWindow;
 pub use transform::RigidTransform;
 pub use up_axis::UpAxis;

@@ -71,6 +71,7 @@ impl SceneFormat for Gltf {
             note_on_place: None,
             options: &[],
             is_read: true,
+            holds_windows: false,
         };
         &ABOUT
     }

@@ -168,6 +168,7 @@ pub(crate) fn scene(recipe: Recipe) -> SceneGraph {
         frame: recipe.frame,
         time_codes: TimeCodes { samples: codes.clone(), times, frames_per_second: 30.0 },
         nodes,
+        windows: Vec::new(),
         cameras: vec![
             camera(&mut numbers, "cam 1", &codes, true),
             camera(&mut numbers, "fixed", &codes, false),

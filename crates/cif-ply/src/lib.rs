@@ -46,6 +46,7 @@ impl SceneFormat for Ply {
             ),
             options: &["time_code", "turn_up"],
             is_read: true,
+            holds_windows: false,
         };
         &ABOUT
     }

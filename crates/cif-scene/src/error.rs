@@ -66,6 +66,12 @@ pub enum SceneError {
         /// Fingerprint of the base.
         base: String,
     },
+    /// Scenes that are no windows of one capture.
+    #[error("the scenes are no windows of one capture: {what}")]
+    Windows {
+        /// What does not fit, and what to do.
+        what: String,
+    },
     /// An option outside its range.
     #[error(transparent)]
     Option(#[from] OptionError),

@@ -164,6 +164,8 @@ pub struct About {
     pub options: &'static [&'static str],
     /// False for files that are made to be looked at, and not read back.
     pub is_read: bool,
+    /// True when files hold splats that change from window to window ([`SceneGraph::windows`]).
+    pub holds_windows: bool,
 }
 
 /// An ending of file names.

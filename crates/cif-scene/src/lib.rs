@@ -15,6 +15,7 @@
 //! | [`motion::keys`] | fewer samples of a track inside an error bound |
 //! | [`motion::velocity`] | how fast a node moves |
 //! | [`motion_scores`] | how well the motion of a graph follows known surface points |
+//! | [`windows`](mod@windows) | graphs of windows of one long capture as one |
 //! | [`placement`] | where a node's splats are at any time |
 //! | [`appearance`] | opacities and colours that change over time, when a node is hidden by them, and the filter of the renderer as part of splats |
 //! | [`shape::extent`] | boxes that hold the 3-sigma ellipsoids |
@@ -62,6 +63,7 @@ mod testing;
 mod tests;
 pub mod to_field;
 pub(crate) mod vectors;
+pub mod windows;
 pub mod world;
 
 pub use diff::{ChangeKind, ObjectChange, SceneDiff};
@@ -77,7 +79,7 @@ pub use graph::{
     Appearance, AppearanceSample, CameraSample, CameraTrack, CodeRange, ConvexHull, DenseMotion, DenseSample,
     FrameRange, IdentityShare, IdentityShares, Motion, MotionModel, MotionReport, Node, NodeKind,
     OptionError, Origin, Part, PartJoint, PartsMotion, PointProxy, PoseSample, ResidualStatistics,
-    SceneGraph, SceneOptions, Splats, TimeCodes, Tolerance, VisibilitySample,
+    SceneGraph, SceneOptions, SceneWindow, Splats, TimeCodes, Tolerance, VisibilitySample,
 };
 pub use motion::loose::LOOSE_SPLATS;
 pub use motion::velocity::Velocity;
@@ -92,6 +94,7 @@ pub use shape::ground::ground_height;
 pub use shape::level_of_detail::level_of_detail;
 pub use shape::mass::{DENSITY, masses};
 pub use to_field::{field_from_graph, time_in_field};
+pub use windows::{Seam, SeamOfObject, joined};
 pub use world::frame_of;
 
 /// Where coordinates lie in the world of the capture; see [`world`].

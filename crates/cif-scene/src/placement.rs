@@ -18,7 +18,7 @@ pub struct PlacedSplats {
 }
 
 impl PlacedSplats {
-    fn turned(mut self, target_from_local: &RigidTransform) -> Self {
+    pub(crate) fn turned(mut self, target_from_local: &RigidTransform) -> Self {
         let turn = quaternion_of(&target_from_local.rotation);
         for mean in &mut self.means {
             *mean = target_from_local.apply(*mean);
@@ -44,24 +44,26 @@ impl Node {
     /// [`Node::world_transform`]; outside the samples the nearest one holds.
     #[must_use]
     pub fn splats_at(&self, time_code: f64) -> PlacedSplats {
-        let world_from_local = self.world_transform(time_code);
+        self.local_splats_at(time_code).turned(&self.world_transform(time_code))
+    }
+
+    /// The same in the local frame of the node at that time.
+    pub(crate) fn local_splats_at(&self, time_code: f64) -> PlacedSplats {
         match &self.motion {
-            Motion::Dense(dense) => {
-                local_splats_at(dense, &self.splats.scales, time_code).turned(&world_from_local)
-            }
+            Motion::Dense(dense) => local_splats_at(dense, &self.splats.scales, time_code),
             Motion::Parts(motion) => {
                 let mut placed = self.resting();
                 for part in &motion.parts {
-                    let world_from_part = world_from_local.compose(&part.node_transform(time_code));
-                    let turn = quaternion_of(&world_from_part.rotation);
+                    let node_from_part = part.node_transform(time_code);
+                    let turn = quaternion_of(&node_from_part.rotation);
                     for index in part.splats.clone() {
-                        placed.means[index] = world_from_part.apply(placed.means[index]);
+                        placed.means[index] = node_from_part.apply(placed.means[index]);
                         placed.orientations[index] = quaternion::multiply(turn, placed.orientations[index]);
                     }
                 }
                 placed
             }
-            _ => self.resting().turned(&world_from_local),
+            _ => self.resting(),
         }
     }
 

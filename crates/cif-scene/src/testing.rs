@@ -240,6 +240,7 @@ pub(crate) fn graph_of(nodes: Vec<Node>) -> SceneGraph {
         frame: CaptureFrame::default(),
         time_codes: TimeCodes { samples: vec![0.0], times: vec![0.0], frames_per_second: 24.0 },
         nodes,
+        windows: Vec::new(),
         cameras: Vec::new(),
         background_color: [1.0; 3],
         sort_metric: SortMetric::Z,

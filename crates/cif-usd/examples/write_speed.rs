@@ -104,6 +104,7 @@ fn scene(count: usize, samples: usize) -> SceneGraph {
             frames_per_second: 24.0,
         },
         nodes: vec![node],
+        windows: Vec::new(),
         cameras: Vec::new(),
         background_color: [0.0; 3],
         sort_metric: cif_field::SortMetric::Z,

@@ -17,6 +17,8 @@ pub(crate) struct Layer<'p, 'py> {
     handle: Bound<'py, PyAny>,
     prim_spec: Bound<'py, PyAny>,
     attribute_spec: Bound<'py, PyAny>,
+    /// Time code at which values stand; `None` where they stand at all times, as defaults.
+    values_at: Option<f64>,
 }
 
 /// Variability of a property: whether it may change over time.
@@ -50,7 +52,19 @@ impl<'p, 'py> Layer<'p, 'py> {
             handle,
             prim_spec: pxr.sdf.getattr("CreatePrimInLayer")?,
             attribute_spec: pxr.sdf.getattr("AttributeSpec")?,
+            values_at: None,
         })
+    }
+
+    /// As [`Layer::create`], for a value clip: values stand at its first time code, and properties that cannot change over
+    /// time are left out.
+    pub(crate) fn create_clip(pxr: &'p Pxr<'py>, path: &Path, first: f64) -> PyResult<Self> {
+        Ok(Self { values_at: Some(first), ..Self::create(pxr, path)? })
+    }
+
+    /// The layer itself.
+    pub(crate) fn handle(&self) -> &Bound<'py, PyAny> {
+        &self.handle
     }
 
     /// Metadata of the layer.
@@ -176,14 +190,20 @@ impl<'l, 'p, 'py> Prim<'l, 'p, 'py> {
         custom: bool,
     ) -> PyResult<Attribute<'l, 'p, 'py>> {
         let pxr = self.layer.pxr;
+        let is_left_out = self.layer.values_at.is_some() && variability == Variability::Uniform;
         let variability = pxr.sdf.getattr(match variability {
             Variability::Varying => "VariabilityVarying",
             Variability::Uniform => "VariabilityUniform",
         })?;
         let value_type = pxr.value_type(value_type)?;
         let spec = self.layer.attribute_spec.call1((&self.spec, name, value_type, variability, custom))?;
-        spec.setattr("default", value)?;
-        Ok(Attribute { layer: self.layer, spec })
+        let attribute = Attribute { layer: self.layer, spec };
+        match self.layer.values_at {
+            _ if is_left_out => {}
+            Some(time_code) => attribute.sample(time_code, value)?,
+            None => attribute.spec.setattr("default", value)?,
+        }
+        Ok(attribute)
     }
 }
 

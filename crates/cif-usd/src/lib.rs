@@ -90,6 +90,7 @@ impl SceneFormat for Usd {
             note_on_place: None,
             options: &["payloads", "levels_of_detail", "ground", "density", "weld_kinematic"],
             is_read: true,
+            holds_windows: true,
         };
         &ABOUT
     }

@@ -69,6 +69,11 @@ pub(crate) fn without_repetitions<const C: usize>(values: &[[f32; C]]) -> (Vec<[
     (unique, repeats.then_some(indices))
 }
 
+/// Indices that every value has, where `always` asks for them although nothing repeats.
+pub(crate) fn indices_or_all(indices: Option<Vec<i32>>, count: usize, always: bool) -> Option<Vec<i32>> {
+    indices.or_else(|| always.then(|| (0..count as i32).collect()))
+}
+
 /// Checksum of colours: 16 hexadecimal digits, the same on every machine.
 pub(crate) fn checksum(colors: &[[f32; 3]]) -> String {
     let mut hash = Multiply(0xcbf2_9ce4_8422_2325);

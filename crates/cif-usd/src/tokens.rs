@@ -33,6 +33,8 @@ pub const CAPTURE_OFFSET: &str = "captureOffset";
 pub const CAPTURE_SCALE: &str = "captureScale";
 /// Warnings of the export, in `customLayerData`.
 pub const WARNINGS: &str = "warnings";
+/// Number of windows of time, where the splats change from window to window.
+pub const WINDOWS: &str = "windows";
 /// Fingerprint of the exported field, in `customLayerData`.
 pub const FIELD_FINGERPRINT: &str = "fieldFingerprint";
 /// Options of the export as JSON, in `customLayerData`.
@@ -72,6 +74,9 @@ pub const FIXED_JOINT: &str = "PhysicsFixedJoint";
 pub const COLLIDER: &str = "Collider";
 /// Ending of the folder of payloads: `out.usda` has `out.payloads`, `out.usdc` has `out.usdc.payloads`.
 pub const PAYLOADS: &str = "payloads";
+/// Layer among the payloads that names what changes from window to window; the name of no node, as those of instances end
+/// in a number.
+pub const MANIFEST: &str = "windows.usdc";
 /// Prim of a payload that every level of detail shares.
 pub const COMMON: &str = "/Common";
 

@@ -118,6 +118,10 @@ pub(crate) fn export(
     options: ExportOptions,
 ) -> Result<ExportSummary, UsdError> {
     pxr::with(|pxr| {
+        let mut options = options;
+        if !graph.windows.is_empty() {
+            options = with_windows(path, options)?;
+        }
         let target = checked(pxr, path, options)?;
         let failed = |reason: String| UsdError::Write { path: path.to_owned(), reason };
         let system = |error: std::io::Error| failed(error.to_string());
@@ -148,6 +152,15 @@ pub(crate) fn export(
             ..ExportSummary::default()
         })
     })
+}
+
+/// Options for a stage whose splats change from window to window: these are files of their own, and have one level of
+/// detail.
+fn with_windows(path: &Path, options: ExportOptions) -> Result<ExportOptions, UsdError> {
+    if options.payloads == Payloads::SingleFile || kind_of(path)? == Kind::Package {
+        return Err(UsdError::WindowsInOneFile { path: path.to_owned() });
+    }
+    Ok(ExportOptions { payloads: Payloads::Separate, levels_of_detail: false, ..options })
 }
 
 /// Takes what is not ours of an old folder of payloads over into the new one, before that takes its place; where it was.

@@ -45,6 +45,7 @@ impl SceneFormat for Html {
             note_on_place: None,
             options: &[],
             is_read: false,
+            holds_windows: false,
         };
         &ABOUT
     }

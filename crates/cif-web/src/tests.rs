@@ -114,6 +114,7 @@ fn graph() -> SceneGraph {
             frames_per_second: 12.0,
         },
         nodes: vec![rigid, box_of_two, jelly],
+        windows: Vec::new(),
         cameras: vec![CameraTrack {
             name: "cam".into(),
             label: "front".into(),

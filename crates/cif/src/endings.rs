@@ -63,10 +63,10 @@ pub(crate) fn is_film(path: &Path) -> bool {
     is_of(&ending(path), &FILMS) && !path.is_dir()
 }
 
-/// A file of an exchange format.
-pub(crate) fn exchanged() -> impl TypedValueParser<Value = PathBuf> {
+/// A file of an exchange format, or a trained scene.
+pub(crate) fn exchanged_or_scene() -> impl TypedValueParser<Value = PathBuf> {
     PathBufValueParser::new().try_map(|path| {
-        if FORMATS.iter().any(|format| format.writes(&path)) {
+        if FORMATS.iter().any(|format| format.writes(&path)) || ending(&path) == "cif" {
             return Ok(path);
         }
         let endings: Vec<String> = FORMATS

@@ -170,6 +170,7 @@ mod tests {
                 frames_per_second: 24.0,
             },
             nodes: vec![node],
+            windows: Vec::new(),
             cameras: Vec::new(),
             background_color: [1.0; 3],
             sort_metric: cif_field::SortMetric::Z,

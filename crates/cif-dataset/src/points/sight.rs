@@ -84,6 +84,7 @@ mod tests {
             layout: Layout::Colmap,
             frames: [("a", Split::Train), ("b", Split::Val)].map(frame).to_vec(),
             times: vec![0.0],
+            window: None,
             frames_per_second: None,
             instances: Vec::new(),
             mask_objects: Default::default(),

@@ -68,6 +68,7 @@ pub fn assemble(mut found: Prims) -> Result<SceneGraph, AssembleError> {
         frame: found.frame,
         time_codes,
         nodes,
+        windows: Vec::new(),
         cameras,
         background_color: found.background_color,
         sort_metric: found.sort_metric,

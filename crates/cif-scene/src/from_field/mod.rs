@@ -33,6 +33,9 @@ const INSTANCE_TRIM: f64 = 0.05;
 /// The same for the background, where unlabelled things may move.
 const BACKGROUND_TRIM: f64 = 0.01;
 
+/// Begin of the warning that names instances without splats.
+pub(crate) const NO_SPLATS: &str = "no visible Gaussian belongs to: ";
+
 /// Builds the scene graph of a field; the trained deformation moves it.
 ///
 /// # Errors
@@ -106,6 +109,8 @@ pub fn build_from(
         nodes.push(node::node(&input, naming, group, chosen));
     }
     node::measure(&mut nodes, &groups, &mut frames_of, &time_codes.samples);
+    // Those of the capture, of which the field may be a window.
+    let source_frames = (time_codes.start().max(0.0) as usize, time_codes.end().max(0.0) as usize);
     let code_of =
         |index: usize| (frames[0]..=frames[frames.len() - 1]).contains(&index).then(|| codes[index]);
     let exposure_of = |recorded: &RecordedCamera| {
@@ -119,7 +124,7 @@ pub fn build_from(
         warnings.push("no camera is recorded, so that the blur of pixels could not be baked".into());
     }
     for (node, group) in nodes.iter_mut().zip(&groups) {
-        node.source_frames = (frames[0], frames[frames.len() - 1]);
+        node.source_frames = source_frames;
         node.visibility = visibility::of_rows(field, &node.splats.rows);
         let thinning = Thinning {
             time_codes: &time_codes.samples,
@@ -154,7 +159,7 @@ pub fn build_from(
                 count => format!("{} ({count} are too faint to be drawn)", field.instances[index].label),
             })
             .collect();
-        warnings.push(format!("no visible Gaussian belongs to: {}", told.join(", ")));
+        warnings.push(format!("{NO_SPLATS}{}", told.join(", ")));
     }
     let declared = field.record.declared;
     let unit = options.meters_per_unit.or(declared.map(|of| of.meters_per_unit));
@@ -162,6 +167,7 @@ pub fn build_from(
         up_axis: options.up_axis.or(declared.map(|of| of.up_axis)).unwrap_or_default(),
         meters_per_unit: unit.unwrap_or(1.0),
         frame: world::frame_of(field)?,
+        windows: Vec::new(),
         cameras,
         time_codes,
         nodes,

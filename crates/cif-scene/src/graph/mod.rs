@@ -13,6 +13,7 @@ mod scene;
 mod shape;
 mod splats;
 mod time;
+mod window;
 
 pub use appearance::{Appearance, AppearanceSample, VisibilitySample, is_visible_at};
 pub use camera::{CameraSample, CameraTrack};
@@ -26,5 +27,7 @@ pub use pose::{PoseSample, pose_at};
 pub use report::{MotionReport, ResidualStatistics, TimeResidual};
 pub use scene::{Origin, SceneGraph};
 pub use shape::{ConvexHull, PointProxy};
+pub(crate) use splats::raise_degree;
 pub use splats::{IdentityShare, IdentityShares, SHARES_PER_SPLAT, Splats};
 pub use time::{CodeRange, TimeCodes};
+pub use window::SceneWindow;

@@ -7,6 +7,7 @@ use super::camera::CameraTrack;
 use super::node::Node;
 use super::options::SceneOptions;
 use super::time::TimeCodes;
+use super::window::SceneWindow;
 
 /// A scene, ready to be written in any format.
 #[derive(Clone, Debug, PartialEq)]
@@ -23,6 +24,9 @@ pub struct SceneGraph {
     pub time_codes: TimeCodes,
     /// One node per instance in the order of the field's instance table, then the background where there is one.
     pub nodes: Vec<Node>,
+    /// What the nodes show window by window, where the scene was trained so (see [`crate::windows`]): at least two, the first
+    /// of which the nodes hold as well. Empty for all others.
+    pub windows: Vec<SceneWindow>,
     /// Recorded cameras.
     pub cameras: Vec<CameraTrack>,
     /// Colour behind everything, display-referred RGB in [0, 1].

@@ -43,6 +43,20 @@ pub struct IdentityShare {
     pub share: f32,
 }
 
+/// Fills coefficients of many splats up from one degree to a higher one.
+pub(crate) fn raise_degree(coefficients: &mut Vec<f32>, from: u8, to: u8) {
+    if from == to {
+        return;
+    }
+    let (from, to) = (3 * coefficient_count(from), 3 * coefficient_count(to));
+    let mut raised = Vec::with_capacity(coefficients.len() / from * to);
+    for row in coefficients.chunks_exact(from) {
+        raised.extend_from_slice(row);
+        raised.resize(raised.len() + to - from, 0.0);
+    }
+    *coefficients = raised;
+}
+
 impl Splats {
     /// Entry of [`Splats::rows`] for a splat that is no row of a field.
     pub const NO_ROW: u32 = u32::MAX;
@@ -84,17 +98,9 @@ impl Splats {
         self.rows.append(&mut more.rows);
     }
 
-    fn raise_degree(&mut self, degree: u8) {
-        if self.sh_degree == degree {
-            return;
-        }
-        let (from, to) = (3 * coefficient_count(self.sh_degree), 3 * coefficient_count(degree));
-        let mut raised = Vec::with_capacity(self.len() * to);
-        for row in self.sh_coefficients.chunks_exact(from) {
-            raised.extend_from_slice(row);
-            raised.resize(raised.len() + to - from, 0.0);
-        }
-        self.sh_coefficients = raised;
+    /// Fills the coefficients up to a degree that is no lower than theirs.
+    pub(crate) fn raise_degree(&mut self, degree: u8) {
+        raise_degree(&mut self.sh_coefficients, self.sh_degree, degree);
         self.sh_degree = degree;
     }
 

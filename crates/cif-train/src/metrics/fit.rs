@@ -238,6 +238,7 @@ mod tests {
             layout: Layout::HyperNerf,
             frames: times.iter().enumerate().map(frame).collect(),
             times,
+            window: None,
             frames_per_second: None,
             instances: [(1, "red mug"), (2, "blue mug"), (5, "instance_5")].map(label).to_vec(),
             mask_objects: Default::default(),

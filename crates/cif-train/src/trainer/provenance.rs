@@ -1,6 +1,6 @@
 //! Record of the training run that produced a field, stored with the field.
 
-use cif_field::{Drawing, Record, Run};
+use cif_field::{Drawing, FrameCodes, Record, Run};
 use serde_json::{Map, Value, json};
 
 use super::Trainer;
@@ -37,9 +37,10 @@ impl Trainer {
                 exposures_in_time: exposures.map(Exposures::in_time).unwrap_or_default(),
             },
             frame: dataset.frame,
-            // Those of the world of the capture, and of its frames.
+            // Those of the world of the capture.
             declared: None,
-            frame_codes: None,
+            frame_codes: dataset.window.filter(|of| of.first > 0).map(|of| FrameCodes::From(of.first as f64)),
+            window: dataset.window.map(|of| of.window),
             capture: dataset.root.file_name().and_then(|name| name.to_str()).map(str::to_owned),
             unknown: dataset.unknown.clone(),
             run: Some(Run {

@@ -234,6 +234,7 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
         layout: Layout::HyperNerf,
         frames,
         times,
+        window: None,
         frames_per_second: Some(10.0),
         mask_objects: Default::default(),
         instances: if scene.masks { [4, 7, 9].map(label).to_vec() } else { Vec::new() },

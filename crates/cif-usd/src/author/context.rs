@@ -29,3 +29,10 @@ pub(crate) struct Scene<'a, 'py> {
     pub(crate) storage: Storage<'a>,
     pub(crate) options: &'a ExportOptions,
 }
+
+impl Scene<'_, '_> {
+    /// True where arrays change from window to window, so that all windows have to store them in the same way.
+    pub(super) fn has_windows(&self) -> bool {
+        !self.graph.windows.is_empty()
+    }
+}

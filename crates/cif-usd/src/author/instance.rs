@@ -1,5 +1,6 @@
 //! One prim per instance: labels, our schema, variants, and where its arrays are kept.
 
+use cif_geometry::Bounds;
 use cif_scene::{Motion, Node, NodeKind, extent};
 use pyo3::prelude::*;
 
@@ -7,7 +8,6 @@ use super::context::{Scene, UNIFORM, VARYING};
 use super::levels::{LEVELS, Level};
 use super::{hulls, levels, metadata, physics, proxies, splats, transforms};
 use crate::layer::{Layer, Prim, child};
-use crate::pxr::Pxr;
 use crate::tokens::{self, instance, variants};
 
 pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, node: &Node) -> PyResult<()> {
@@ -38,7 +38,7 @@ pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, node: &Node) 
     }
     properties(scene, &prim, node)?;
     visibility(&prim, node)?;
-    extents_hint(pxr, &prim, node)?;
+    extents_hint(scene, &prim, node)?;
     transforms::order(pxr, &prim)?;
     for (index, part) in node.motion.parts().map_or(&[][..], |motion| &motion.parts).iter().enumerate() {
         let inside = layer.define(&child(prim.path(), &part.name), "Xform")?;
@@ -71,7 +71,7 @@ fn properties(scene: &Scene<'_, '_>, prim: &Prim<'_, '_, '_>, node: &Node) -> Py
     let frames = pxr.gf.call_method1("Vec2i", (int(first), int(last)))?;
     prim.set(instance::SOURCE_FRAMES, "Int2", UNIFORM, frames)?;
     prim.set(instance::MEAN_OCCUPANCY, "Float", UNIFORM, node.mean_occupancy)?;
-    prim.set(instance::MODEL, "Token", UNIFORM, node.model().to_string())?;
+    prim.set(instance::MODEL, "Token", UNIFORM, report.model.to_string())?;
     if let Some(rotation) = report.rotation {
         prim.set(instance::ROTATION, "Token", UNIFORM, rotation.to_string())?;
     }
@@ -104,12 +104,30 @@ fn visibility(prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult<()> {
 
 /// Box of what can be seen of an instance, without strays, whose own prims hold all their splats. A viewer frames it, and
 /// boxes are asked for without loading payloads.
-fn extents_hint(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult<()> {
+fn extents_hint(scene: &Scene<'_, '_>, prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult<()> {
     if node.kind == NodeKind::Background {
         return Ok(());
     }
+    let of_windows = scene.graph.windows.iter().flat_map(|window| {
+        let node = window.nodes.iter().find(|of_window| of_window.name == node.name);
+        node.map_or_else(Vec::new, |node| boxes_in_time(node, Some(window.start)))
+    });
+    let mut boxes: Vec<(f64, Bounds)> = of_windows.collect();
+    if boxes.is_empty() {
+        boxes = boxes_in_time(node, None);
+    }
+    let corners = |bounds: &Bounds| scene.pxr.vec3f_array(&extent::outward(bounds));
+    let at_rest = match boxes.first() {
+        Some((_, bounds)) => corners(bounds)?,
+        None => corners(&node.boxes().local(0.0))?,
+    };
+    let hint = prim.set(tokens::EXTENTS_HINT, "Float3Array", VARYING, at_rest)?;
+    boxes.iter().try_for_each(|(code, bounds)| hint.sample(*code, corners(bounds)?))
+}
+
+/// Boxes of a node at the times at which its splats change, and from `start` on.
+fn boxes_in_time(node: &Node, start: Option<f64>) -> Vec<(f64, Bounds)> {
     let boxes = node.boxes();
-    let at = |time_code: f64| pxr.vec3f_array(&extent::outward(&boxes.local(time_code)));
     let mut codes: Vec<f64> = match &node.motion {
         Motion::Static | Motion::Rigid(_) => Vec::new(),
         Motion::Parts(motion) => {
@@ -117,11 +135,10 @@ fn extents_hint(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult
         }
         Motion::Dense(dense) => dense.samples.iter().map(|sample| sample.time_code).collect(),
     };
+    codes.extend(start);
     codes.sort_unstable_by(f64::total_cmp);
     codes.dedup();
-    let at_rest = at(codes.first().copied().unwrap_or(0.0))?;
-    let hint = prim.set(tokens::EXTENTS_HINT, "Float3Array", VARYING, at_rest)?;
-    codes.iter().try_for_each(|code| hint.sample(*code, at(*code)?))
+    codes.into_iter().map(|code| (code, boxes.local(code))).collect()
 }
 
 /// Splats, proxies and colliders: in the root layer or in a payload; splats once per level of detail.
@@ -172,7 +189,7 @@ fn shared(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, place: &str, node: &Node
     hulls::author(scene, layer, place, node)
 }
 
-fn splats_of(
+pub(super) fn splats_of(
     scene: &Scene<'_, '_>,
     layer: &Layer<'_, '_>,
     place: &str,

@@ -36,6 +36,9 @@ pub(super) fn author(
         for (key, values) in [(tokens::OMITTED, &graph.omitted), (tokens::WARNINGS, &graph.warnings)] {
             ours.set_item(key, pxr.vt.call_method1("StringArray", (values.clone(),))?)?;
         }
+        if !graph.windows.is_empty() {
+            ours.set_item(tokens::WINDOWS, graph.windows.len())?;
+        }
         ours.set_item(tokens::SORT, splats::sorting(graph.sort_metric))?;
         if let Some(antialiased) = graph.antialiased {
             ours.set_item(tokens::ANTIALIASED, antialiased)?;

@@ -1,6 +1,7 @@
 //! Authoring of a stage from a scene graph.
 
 mod camera_prims;
+mod clips;
 mod context;
 mod ground;
 mod hulls;
@@ -33,6 +34,7 @@ pub(crate) fn author(scene: &Scene<'_, '_>, root: &Path) -> PyResult<()> {
     for node in &graph.nodes {
         instance::author(scene, &layer, node)?;
     }
+    clips::author(scene, &world)?;
     if !graph.cameras.is_empty() {
         layer.define(tokens::CAMERAS, "Scope")?;
         for track in &graph.cameras {

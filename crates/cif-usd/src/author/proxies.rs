@@ -63,7 +63,7 @@ fn points(
     }
     let widths = prim.set("widths", "FloatArray", VARYING, pxr.float_array(widths)?)?;
     widths.info("interpolation", tokens::VERTEX)?;
-    splats::display_color(pxr, &prim, &proxy.colors[range])?;
+    splats::display_color(scene, &prim, &proxy.colors[range])?;
     let indices = crate::primvars::as_ints(indices);
     splats::ints(pxr, &prim, tokens::PRIMVAR_SPLAT, &indices)
 }

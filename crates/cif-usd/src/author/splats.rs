@@ -2,6 +2,7 @@
 
 use cif_field::SortMetric;
 use cif_geometry::{Bounds, RigidTransform};
+use cif_scene::graph::SHARES_PER_SPLAT;
 use cif_scene::{IdentityShares, extent};
 use pyo3::prelude::*;
 
@@ -75,10 +76,12 @@ pub(super) fn author(
     let colors = primvars::base_colors(&coefficients, selection.degree());
     let changes = &selection.appearance().colors;
     if changes.is_empty() {
-        display_color(pxr, &prim, &colors)?;
+        display_color(scene, &prim, &colors)?;
     } else {
         let display = prim.set(tokens::DISPLAY_COLOR, "Color3fArray", VARYING, pxr.vec3f_array(&colors)?)?;
         display.info("interpolation", tokens::VERTEX)?;
+        let all = primvars::indices_or_all(None, colors.len(), scene.has_windows());
+        set_indices(pxr, &prim, tokens::DISPLAY_COLOR, all)?;
         for sample in changes {
             let coefficients = selection.coefficients(&sample.values);
             sh.sample(sample.time_code, pxr.vec3f_array_flat(&coefficients)?)?;
@@ -97,19 +100,28 @@ pub(super) fn author(
         let (unique, indices) = primvars::without_repetitions(values.as_chunks::<1>().0);
         let attribute = prim.set(name, "FloatArray", VARYING, pxr.float_array(unique.as_flattened())?)?;
         attribute.info("interpolation", tokens::VERTEX)?;
+        let indices = primvars::indices_or_all(indices, values.len(), scene.has_windows());
         set_indices(pxr, &prim, name, indices)?;
     }
     if !splats.identities.is_empty() {
-        instance_shares(pxr, &prim, &selection.of(&splats.identities))?;
+        instance_shares(scene, &prim, &selection.of(&splats.identities))?;
     }
     let rows = primvars::as_ints(&selection.of(&splats.rows));
     ints(pxr, &prim, tokens::PRIMVAR_ROW, &rows)
 }
 
 /// The instances that every splat may belong to, as many places per splat as any of them needs.
-fn instance_shares(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, identities: &[IdentityShares]) -> PyResult<()> {
+fn instance_shares(
+    scene: &Scene<'_, '_>,
+    prim: &Prim<'_, '_, '_>,
+    identities: &[IdentityShares],
+) -> PyResult<()> {
+    let pxr = scene.pxr;
     let used = |shares: &IdentityShares| shares.iter().filter(|entry| entry.id != 0).count();
-    let places = identities.iter().map(used).max().unwrap_or(0).max(1);
+    let places = match scene.has_windows() {
+        true => SHARES_PER_SPLAT,
+        false => identities.iter().map(used).max().unwrap_or(0).max(1),
+    };
     let entries = || identities.iter().flat_map(|shares| &shares[..places]);
     let ids: Vec<i32> = entries().map(|entry| i32::from(entry.id)).collect();
     let mut shares: Vec<f32> = entries().map(|entry| entry.share).collect();
@@ -136,8 +148,14 @@ pub(super) fn ints(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, name: &str, values: &
 }
 
 /// Colours for viewers that do not read spherical harmonics.
-pub(super) fn display_color(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, colors: &[[f32; 3]]) -> PyResult<()> {
+pub(super) fn display_color(
+    scene: &Scene<'_, '_>,
+    prim: &Prim<'_, '_, '_>,
+    colors: &[[f32; 3]],
+) -> PyResult<()> {
+    let pxr = scene.pxr;
     let (unique, indices) = primvars::without_repetitions(colors);
+    let indices = primvars::indices_or_all(indices, colors.len(), scene.has_windows());
     let attribute = prim.set(tokens::DISPLAY_COLOR, "Color3fArray", VARYING, pxr.vec3f_array(&unique)?)?;
     attribute.info("interpolation", tokens::VERTEX)?;
     set_indices(pxr, prim, tokens::DISPLAY_COLOR, indices)

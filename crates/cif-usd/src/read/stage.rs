@@ -35,6 +35,7 @@ struct Mark {
     background: [f32; 3],
     omitted: Vec<String>,
     warnings: Vec<String>,
+    windows: i64,
     sort: Option<String>,
     antialiased: Option<bool>,
     frame: CaptureFrame,
@@ -51,6 +52,9 @@ pub(crate) fn scene(path: &Path, options: ReadOptions) -> Result<SceneGraph, Usd
         if mark.ours && mark.layout != expected {
             let (path, generator, found) = (path.to_owned(), mark.generator, mark.layout);
             return Err(UsdError::Layout { path, generator, found, expected });
+        }
+        if mark.windows > 1 {
+            return Err(UsdError::Windows { path: path.to_owned(), windows: mark.windows });
         }
         if !mark.frame.is_valid() {
             let problem = format!("its layer places the scene nowhere ({:?})", mark.frame);
@@ -248,6 +252,7 @@ fn mark(stage: &Bound<'_, PyAny>) -> PyResult<Mark> {
             background,
             omitted: strings(tokens::OMITTED)?,
             warnings: strings(tokens::WARNINGS)?,
+            windows: get(tokens::WINDOWS)?.and_then(|windows| windows.extract().ok()).unwrap_or(0),
             sort: string(tokens::SORT)?,
             antialiased: get(tokens::ANTIALIASED)?.and_then(|value| value.extract().ok()),
             frame,

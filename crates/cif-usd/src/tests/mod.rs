@@ -12,6 +12,7 @@ mod round_trip;
 mod scenes;
 mod schema;
 mod search_path;
+mod windows;
 
 use std::path::Path;
 

@@ -33,6 +33,11 @@ impl Maker {
         Self { chance, codes }
     }
 
+    /// As [`Maker::new`], sampled at these time codes.
+    pub(super) fn at(seed: u64, codes: Vec<f64>) -> Self {
+        Self { codes, ..Self::new(seed) }
+    }
+
     fn float(&mut self, low: f32, high: f32) -> f32 {
         self.chance.random_range(low..high)
     }
@@ -341,6 +346,7 @@ impl Maker {
                 frames_per_second: 12.5,
             },
             nodes,
+            windows: Vec::new(),
             cameras: vec![self.camera("hand_held", true), self.camera("tripod", false)],
             background_color: [0.1, 0.2, 0.3],
             sort_metric: cif_field::SortMetric::Distance,

@@ -81,9 +81,7 @@ pub(super) fn run(command: &Eval) -> Result<(), Error> {
     outputs.reads(&command.scene)?;
     command.report.check(&mut outputs)?;
     let (field, decoder) = scene::load_with_head(&command.scene)?;
-    let mut capture = command.capture_options.clone();
-    capture.downscale = capture.downscale.or(scene::trained_downscale(&field));
-    let dataset = capture.open(&command.capture)?;
+    let dataset = command.capture_options.as_trained(&field).open(&command.capture)?;
     print_warnings(&dataset);
     outputs.reads_capture(&dataset)?;
     for file in dataset.motion_files().iter().flatten() {

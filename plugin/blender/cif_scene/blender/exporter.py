@@ -202,6 +202,11 @@ def _colors(instance: Instance, obj: bpy.types.Object) -> Iterator[tuple[str, ob
 
     parts = {child[PART]: child for child in obj.children if PART in child}
     for piece in instance.pieces:
+        if piece.visibility is not None:
+            raise EditError(
+                f"{obj.name}: its splats change from window to window, and new colours of them cannot be kept; "
+                "undo that, or set the tint back to white"
+            )
         each = parts.get(piece.path) if parts else obj
         if each is None or each.type != "MESH" or splats.COLORS not in each.data:
             continue
@@ -258,6 +263,9 @@ def _part_edits(
     if obj.type != "EMPTY":
         return
     for piece in instance.pieces:
+        # Windows move with their object.
+        if piece.visibility is not None:
+            continue
         child = present.get(piece.path)
         if child is None:
             yield Edit(piece.frame, deleted=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +11,7 @@ import bpy
 import numpy as np
 
 from ..io.color import linear_from_display
-from ..io.scene import Camera, Instance, Piece, Scene
+from ..io.scene import Camera, Instance, Piece, Scene, Visibility
 from ..io.tracks import Track
 from . import animation, nodes
 from .splats import add_modifier, splat_mesh
@@ -120,7 +121,8 @@ def _instance(
             part = _splats(f"{instance.name}.{piece.name}", piece, options, look)
             part.parent = obj
             place(part, piece.track)
-            part[PART] = piece.path
+            if piece.visibility is None:
+                part[PART] = piece.path
             objects.append(part)
     obj.parent = root
     place(obj, instance.track)
@@ -129,10 +131,11 @@ def _instance(
     obj[PRIM] = instance.path
     obj["instance"] = instance.instance
     obj[IMPORTED] = obj.name
-    for each in objects:
+    of_windows = [piece.visibility for piece in instance.pieces] if not single else []
+    for each, visibility in itertools.zip_longest(objects, [None, *of_windows]):
         each["label"] = instance.label
         each["display_name"] = instance.display_name
-        _hide(each, instance)
+        _hide(each, visibility or instance.visibility)
     return objects
 
 
@@ -164,9 +167,8 @@ def place(obj: bpy.types.Object, track: Track) -> None:
     obj.delta_location, obj.delta_rotation_quaternion = track.translations[0], track.rotations[0]
 
 
-def _hide(obj: bpy.types.Object, instance: Instance) -> None:
+def _hide(obj: bpy.types.Object, visibility: Visibility) -> None:
     """Visibility over time, held between changes."""
-    visibility = instance.visibility
     hidden = ~visibility.visible
     obj.hide_render = obj.hide_viewport = bool(hidden[0])
     if len(visibility.codes) > 1:

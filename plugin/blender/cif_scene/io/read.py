@@ -30,6 +30,9 @@ LEFT_OUT = ("cif:label", "cif:category", "cif:motion:report")
 """Properties of our schema that are found elsewhere, or are too long to show."""
 MAX_SHEAR = 1e-4
 
+Span = tuple[float, float]
+"""Time codes of a window: its first, and that of the next one."""
+
 
 class StageError(ValueError):
     """A stage that cannot be shown; the message names the file or prim and what is wrong."""
@@ -160,15 +163,19 @@ def _instance(
     user_label = _value(prim, USER_LABEL)
     display_name = str(user_label or prim.GetDisplayName() or (classes[-1] if classes else prim.GetName()))
     instance = _labels(prim, INSTANCE_LABELS)
+    visibility = _visibility(splats[0] if len(splats) == 1 else prim)
     pieces = [
         Piece(
             path=str(piece.GetPath()),
-            name=_frame(prim, piece).GetName(),
+            name=_frame(prim, piece).GetName() if span is None else f"window_{number + 1}",
             frame=str(_frame(prim, piece).GetPath()),
-            splats=_splats(piece, harmonics) if arrays else EMPTY,
+            splats=_splats(piece, harmonics, span) if arrays else EMPTY,
             track=_track(piece, prim, warnings),
+            visibility=shown,
         )
         for piece in splats
+        for number, span in enumerate(_windows(piece))
+        if (shown := None if span is None else _during(visibility, span)) is None or shown.visible.any()
     ]
     return Instance(
         path=str(prim.GetPath()),
@@ -178,9 +185,37 @@ def _instance(
         instance=instance[0] if instance else prim.GetName(),
         track=_track(prim, root, warnings),
         pieces=pieces,
-        visibility=_visibility(splats[0] if len(splats) == 1 else prim),
+        visibility=visibility,
         data=_data(prim),
     )
+
+
+def _windows(prim: Usd.Prim) -> list[Span | None]:
+    """Windows of time in which a prim has splats of its own; one `None` where it has the same at all times."""
+    marks = [layer.customLayerData.get(MARK) or {} for layer in prim.GetStage().GetLayerStack()]
+    if not any(mark.get("windows") for mark in marks):
+        return [None]
+    ancestor = prim
+    while ancestor and not ancestor.IsPseudoRoot():
+        active = Usd.ClipsAPI(ancestor).GetClipActive() or []
+        if len(active) > 1:
+            starts = [float(start) for start, _ in active]
+            return list(itertools.pairwise([*starts, np.inf]))
+        ancestor = ancestor.GetParent()
+    return [None]
+
+
+def _during(visibility: Visibility, span: Span) -> Visibility:
+    """Visibility inside a window of time, and none outside."""
+    first, end = span
+    inside = (visibility.codes > first) & (visibility.codes < end)
+    at_first = visibility.visible[max(np.searchsorted(visibility.codes, first, side="right") - 1, 0)]
+    # Before it begins; a code that no frame has.
+    codes = [first - 1.0, first, *visibility.codes[inside]]
+    visible = [False, at_first, *visibility.visible[inside]]
+    if np.isfinite(end):
+        codes, visible = [*codes, end], [*visible, False]
+    return Visibility(np.array(codes, np.float64), np.array(visible, bool))
 
 
 def _frame(owner: Usd.Prim, piece: Usd.Prim) -> Usd.Prim:
@@ -287,7 +322,9 @@ def _quaternions(prim: Usd.Prim, attribute: Usd.Attribute, code: float | None = 
     return (xyzw / norms)[:, [3, 0, 1, 2]]
 
 
-def _splats(prim: Usd.Prim, harmonics: bool) -> Splats:
+def _splats(prim: Usd.Prim, harmonics: bool, span: Span | None) -> Splats:
+    at = None if span is None else span[0]
+
     def needed(name: str) -> Usd.Attribute:
         attribute = _attribute(prim, name)
         if attribute is None:
@@ -300,11 +337,14 @@ def _splats(prim: Usd.Prim, harmonics: bool) -> Splats:
         return values
 
     position, rotation, scale = (needed(name) for name in ("positions", "orientations", "scales"))
-    positions = _array(prim, position, 3)
+    positions = _array(prim, position, 3, at)
     count = len(positions)
     occupancy = UsdGeom.PrimvarsAPI(prim).GetPrimvar("cif:occupancy")
-    occupancies = np.asarray(occupancy.ComputeFlattened(), np.float32) if occupancy.HasAuthoredValue() else None
-    codes = sorted({code for attribute in (position, rotation, scale) for code in attribute.GetTimeSamples()})
+    time = Usd.TimeCode.Default() if at is None else Usd.TimeCode(at)
+    occupancies = (
+        np.asarray(occupancy.ComputeFlattened(time), np.float32) if occupancy.HasAuthoredValue() else None
+    )
+    codes = sorted({code for attribute in (position, rotation, scale) for code in _codes(attribute, span)})
     samples = None
     if len(codes) > 1:
         samples = SplatSamples(
@@ -314,24 +354,30 @@ def _splats(prim: Usd.Prim, harmonics: bool) -> Splats:
                 [sized(_quaternions(prim, rotation, code), "orientations") for code in codes]
             ),
             scales=[sized(_array(prim, scale, 3, code), "scales") for code in codes]
-            if scale.GetNumTimeSamples() > 1
+            if len(_codes(scale, span)) > 1
             else None,
         )
     return Splats(
         positions=positions,
-        rotations=sized(_quaternions(prim, rotation), "orientations"),
-        scales=sized(_array(prim, scale, 3), "scales"),
-        opacities=sized(_array(prim, needed("opacities"), 1), "opacities"),
-        harmonics=_harmonics(prim, count, harmonics),
+        rotations=sized(_quaternions(prim, rotation, at), "orientations"),
+        scales=sized(_array(prim, scale, 3, at), "scales"),
+        opacities=sized(_array(prim, needed("opacities"), 1, at), "opacities"),
+        harmonics=_harmonics(prim, count, harmonics, at),
         occupancies=None if occupancies is None else sized(occupancies, "primvars:cif:occupancy"),
         samples=samples,
-        fade=_fade(prim, needed("opacities"), count),
+        fade=_fade(prim, needed("opacities"), count, span),
     )
 
 
-def _fade(prim: Usd.Prim, attribute: Usd.Attribute, count: int) -> Fade | None:
-    """Opacities over time, where they change."""
+def _codes(attribute: Usd.Attribute, span: Span | None) -> list[float]:
+    """Time codes of the samples of an attribute, of one window where there are several."""
     codes = attribute.GetTimeSamples()
+    return codes if span is None else [code for code in codes if span[0] <= code < span[1]]
+
+
+def _fade(prim: Usd.Prim, attribute: Usd.Attribute, count: int, span: Span | None) -> Fade | None:
+    """Opacities over time, where they change."""
+    codes = _codes(attribute, span)
     if len(codes) < 2:
         return None
     opacities = [_array(prim, attribute, 1, code) for code in codes]
@@ -350,14 +396,15 @@ def _hemispheres(rotations: list[np.ndarray]) -> list[np.ndarray]:
     return rotations
 
 
-def _harmonics(prim: Usd.Prim, count: int, all_bands: bool) -> np.ndarray:
+def _harmonics(prim: Usd.Prim, count: int, all_bands: bool, at: float | None) -> np.ndarray:
     """Coefficients [N, K, 3]; one band from `displayColor`, else grey, where there are none."""
     from .color import BAND_0
 
     attribute = _attribute(prim, COEFFICIENTS)
     if attribute is None:
         primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("displayColor")
-        colors = np.asarray(primvar.ComputeFlattened() if primvar.HasAuthoredValue() else [], np.float32)
+        time = Usd.TimeCode.Default() if at is None else Usd.TimeCode(at)
+        colors = np.asarray(primvar.ComputeFlattened(time) if primvar.HasAuthoredValue() else [], np.float32)
         colors = colors.reshape(-1, 3)
         if len(colors) != count:
             colors = np.broadcast_to(colors[:1] if len(colors) else np.float32(0.5), (count, 3))
@@ -368,7 +415,7 @@ def _harmonics(prim: Usd.Prim, count: int, all_bands: bool) -> np.ndarray:
     if degree not in (0, 1, 2, 3):
         raise StageError(f"{prim.GetPath()}: {DEGREE} is {degree}; 0 to 3 can be shown")
     bands = (degree + 1) ** 2
-    flat = _array(prim, attribute, 3)
+    flat = _array(prim, attribute, 3, at)
     if len(flat) != count * bands:
         raise StageError(
             f"{prim.GetPath()}: {COEFFICIENTS} has {len(flat)} values; degree {degree} with {count} splats "

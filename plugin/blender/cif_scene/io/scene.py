@@ -61,21 +61,6 @@ class Splats:
 
 
 @dataclass(frozen=True)
-class Piece:
-    """One splat prim of an instance."""
-
-    path: str
-    """Path of the splat prim."""
-    name: str
-    """Name that tells it from its siblings, e.g. `part_00`."""
-    frame: str
-    """Path of the prim that moves it within the instance: its parent, or the splat prim itself."""
-    splats: Splats
-    track: Track
-    """Poses in the frame of the instance."""
-
-
-@dataclass(frozen=True)
 class Visibility:
     """When something can be seen; each state holds until the next."""
 
@@ -83,6 +68,23 @@ class Visibility:
     """Ascending time codes, [T]; a single one where nothing changes."""
     visible: np.ndarray
     """State from each code on, [T] bool."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One splat prim of an instance, or what it holds during one window of time."""
+
+    path: str
+    """Path of the splat prim."""
+    name: str
+    """Name that tells it from its siblings, e.g. `part_00` or `window_1`."""
+    frame: str
+    """Path of the prim that moves it within the instance: its parent, or the splat prim itself."""
+    splats: Splats
+    track: Track
+    """Poses in the frame of the instance."""
+    visibility: Visibility | None = None
+    """When it shows, where splats change from window to window of a long capture; else `None`."""
 
 
 @dataclass(frozen=True)

@@ -182,13 +182,11 @@ fn step(command: &Step) -> Result<(), Error> {
     if !command.instances.is_empty() && stage != Stage::Instance {
         return Err(no_instances());
     }
-    let mut capture = command.capture_options.clone();
-    capture.downscale = capture.downscale.or(field.as_ref().and_then(scene::trained_downscale)).or(resolve(
-        command,
-        field.as_ref(),
-        layout,
-    )?
-    .downscale);
+    let mut capture = match &field {
+        Some(field) => command.capture_options.as_trained(field),
+        None => command.capture_options.clone(),
+    };
+    capture.downscale = capture.downscale.or(resolve(command, field.as_ref(), layout)?.downscale);
     let mut dataset = capture.open(&command.capture)?;
     let config = resolve(command, field.as_ref(), dataset.layout)?;
     if field.is_none() && config.model.triangulate {

@@ -17,7 +17,7 @@ use serde::Serialize;
 
 use super::preset::Preferred;
 use super::targets::{Target, Targets, Writing};
-use crate::commands::shared::scene::{self, code_at};
+use crate::commands::shared::scene::code_at;
 use crate::commands::shared::table::number;
 use crate::commands::shared::{CaptureOptions, print_misfits, print_warnings};
 use crate::error::Error;
@@ -170,6 +170,11 @@ impl ImageScores {
 }
 
 impl Check {
+    /// True with --check.
+    pub(super) fn is_asked(&self) -> bool {
+        self.check
+    }
+
     /// Checks that there is something to compare before the work starts.
     pub(super) fn refuse(
         &self,
@@ -228,9 +233,7 @@ impl Check {
         let dataset = match &self.capture {
             None => None,
             Some(path) => {
-                let mut options = self.capture_options.clone();
-                options.downscale = options.downscale.or(scene::trained_downscale(field));
-                let dataset = options.open(path)?;
+                let dataset = self.capture_options.as_trained(field).open(path)?;
                 outputs.reads_capture(&dataset)?;
                 print_warnings(&dataset);
                 print_misfits(field, &dataset, Split::Val);

@@ -3,6 +3,7 @@
 mod check;
 mod preset;
 mod targets;
+mod windows;
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -10,7 +11,9 @@ use std::path::PathBuf;
 use cif_dataset::MotionTruth;
 use cif_field::Field;
 use cif_scene::graph::ReportRow;
-use cif_scene::{FrameRange, MotionModel, Node, SceneFormat, SceneGraph, SceneOptions, Tolerance, UpAxis};
+use cif_scene::{
+    FrameRange, MotionModel, Node, SceneFormat, SceneGraph, SceneOptions, Seam, Tolerance, UpAxis,
+};
 use clap::{ArgGroup, Args};
 use serde::Serialize;
 
@@ -47,6 +50,11 @@ their residuals.
   cif export table.cif --ply frames --ply-sequence      a folder has no ending: its flag says the format
   cif export table.cif --report --ground-truth motion.json
   cif export table.cif table.usda --for mujoco          or newton, isaac, blender, web: --help shows their flags
+
+A long capture that was trained in windows of time (`cif train --window`, `cif batch` with train.windows)
+becomes one stage, in which every object keeps one path and its splats change from window to window:
+
+  cif export walk.1.cif walk.2.cif walk.3.cif walk.usda
 
 --check reads every file back as `cif import` would and compares it with the scene, from cameras that
 the scene recorded and, with --capture, from those of held-out images. PSNR of an object is over the
@@ -124,6 +132,8 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     command.targets.check(&command.writing, &preferred, command.force, &mut outputs)?;
     let bakes_blur = command.bake_blur.or(preferred.bake_blur).unwrap_or_default();
     command.check.refuse(&command.targets, &command.writing, &preferred, bakes_blur)?;
+    windows::refuse(&command.targets, command.frames.is_some(), command.check.is_asked())?;
+    command.targets.windows.iter().try_for_each(|window| outputs.reads(window))?;
     if let Some(preset) = command.preset {
         note!("--for {} is {}; flags on the command line override it", preset.name(), preset.flags());
     }
@@ -133,10 +143,14 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     let notes = command.targets.iter().filter_map(|target| target.format.about().note_on_place);
     scene::note_frame(&scene::frame(&field)?, notes);
     // The graph is as rich as the richest of the formats.
-    let asked = SceneOptions { bake_blur: bakes_blur, ..options(command, &preferred, &field) };
-    let held = command.targets.iter().map(|target| target.format.held(&asked));
-    let options = held.max_by_key(|held| held.most_expensive_motion).unwrap_or_else(|| asked.clone());
-    let graph = cif_scene::build(&field, &options).map_err(Error::plain)?;
+    let options_of = |field: &Field| {
+        let asked = SceneOptions { bake_blur: bakes_blur, ..options(command, &preferred, field) };
+        let held = command.targets.iter().map(|target| target.format.held(&asked));
+        held.max_by_key(|held| held.most_expensive_motion).unwrap_or(asked)
+    };
+    let graph = cif_scene::build(&field, &options_of(&field)).map_err(Error::plain)?;
+    let options = options_of(&field);
+    let (graph, seams) = windows::with_further(graph, &command.targets.windows, options_of)?;
     for warning in &graph.warnings {
         crate::messages::warning!("{warning}");
     }
@@ -175,6 +189,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
             .map(simplified)
             .collect(),
         check: checker.is_some().then(|| findings.iter().map(|finding| finding.report(&field)).collect()),
+        seams: &seams,
     };
     let print = || {
         print_motion(&graph, &masses);
@@ -188,6 +203,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         if let Some(errors) = &errors {
             print_errors(errors);
         }
+        windows::print(&seams, graph.meters_per_unit);
         findings.iter().for_each(|finding| finding.print(&field));
     };
     command.tables.give(tables, print)
@@ -209,6 +225,9 @@ struct ExportReport<'a> {
     /// Every file that was read back and compared with the scene; absent without `--check`.
     #[serde(skip_serializing_if = "Option::is_none")]
     check: Option<Vec<FileCheck<'a>>>,
+    /// Where windows of time meet, how far they differ in where objects are; absent for one scene.
+    #[serde(skip_serializing_if = "<[_]>::is_empty")]
+    seams: &'a [Seam],
 }
 
 impl JsonReport for ExportReport<'_> {

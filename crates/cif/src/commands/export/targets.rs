@@ -8,14 +8,18 @@ use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches, value_pars
 use super::preset::Preferred;
 use crate::endings;
 use crate::error::Error;
-use crate::formats::FORMATS;
+use crate::formats::{self, FORMATS};
 use crate::messages::{note, outcome};
 use crate::moment::{Frames, Moment, note_fraction};
 use crate::output::{self, Outputs};
 
-/// Files to write: `OUT` by its ending, `--usd OUT`, `--gltf OUT` and so on.
+/// Files to write: `OUT` by its ending, `--usd OUT`, `--gltf OUT` and so on; and further scenes among them.
 #[derive(Debug, Default)]
-pub(super) struct Targets(Vec<Target>);
+pub(super) struct Targets {
+    files: Vec<Target>,
+    /// Scenes of other windows of time of the same capture.
+    pub(super) windows: Vec<PathBuf>,
+}
 
 /// Files that are given without a flag.
 pub(super) const FILES: &str = "files";
@@ -41,14 +45,15 @@ fn written(format: &dyn SceneFormat) -> Vec<String> {
 impl Args for Targets {
     fn augment_args(command: Command) -> Command {
         let help = format!(
-            "Files to write; the endings decide the formats: {}",
+            "Files to write; the endings decide the formats: {}. Further .cif are other windows of time of the same \
+             capture, which become one stage",
             FORMATS.into_iter().flat_map(written).collect::<Vec<_>>().join(", ")
         );
         let files = Arg::new(FILES)
             .value_name("OUT")
             .num_args(0..)
             .action(ArgAction::Append)
-            .value_parser(endings::exchanged())
+            .value_parser(endings::exchanged_or_scene())
             .help(help);
         let command = command.arg(files);
         FORMATS.into_iter().fold(command, |command, format| {
@@ -82,7 +87,9 @@ impl FromArgMatches for Targets {
             let format = FORMATS.into_iter().find(|format| format.writes(path))?;
             Some(Target { format, path: path.clone() })
         });
-        Ok(Self(by_ending.chain(given).collect()))
+        let windows = matches.get_many::<PathBuf>(FILES).into_iter().flatten();
+        let windows = windows.filter(|path| formats::is_field(path)).cloned().collect();
+        Ok(Self { files: by_ending.chain(given).collect(), windows })
     }
 
     fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
@@ -180,7 +187,7 @@ impl Writing {
 
 impl Targets {
     pub(super) fn iter(&self) -> std::slice::Iter<'_, Target> {
-        self.0.iter()
+        self.files.iter()
     }
 
     /// Checks names and places before the work starts.
@@ -197,7 +204,7 @@ impl Targets {
             ("--ply-sequence", writing.ply_sequence),
             ("--ply-up", writing.ply_up.is_some()),
         ];
-        let has_ply = self.0.iter().any(|target| target.format.about().most_expensive_motion.is_none());
+        let has_ply = self.files.iter().any(|target| target.format.about().most_expensive_motion.is_none());
         if let Some((flag, _)) = of_ply.into_iter().find(|(_, is_given)| *is_given && !has_ply) {
             return Err(Error::usage(
                 format!("{flag} is about a PLY, and none is written"),
@@ -205,7 +212,7 @@ impl Targets {
             ));
         }
         let options = writing.without_moment(preferred, force);
-        self.0.iter().try_for_each(|target| target.check(&options, outputs))
+        self.files.iter().try_for_each(|target| target.check(&options, outputs))
     }
 }
 

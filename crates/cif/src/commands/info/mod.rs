@@ -6,7 +6,7 @@ mod gpu;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
-use cif_dataset::{Dataset, InstanceLabel, Layout, PointSource, Split};
+use cif_dataset::{Dataset, InstanceLabel, Layout, PointSource, Split, TimeWindow};
 use cif_field::{Checkpoint, Field, Instance, Record};
 use cif_geometry::{Bounds, CaptureFrame};
 use cif_scene::SceneOptions;
@@ -157,6 +157,10 @@ facts! {
         sh_degree: u8,
         /// Captured times.
         times: usize,
+        /// Window of time of the capture, as in 2/4 for the second of four; null where it is all of it.
+        window: Option<TimeWindow>,
+        /// Time codes of the first and the last time.
+        time_codes: [f64; 2],
         /// Frames per second.
         frames_per_second: f64,
         /// Names of the cameras.
@@ -283,6 +287,8 @@ fn scene_facts(checkpoint: &Checkpoint) -> SceneFacts {
         moving: field.deformation.is_some(),
         sh_degree: field.sh_degree,
         times: field.timeline.times.len(),
+        window: field.record.window,
+        time_codes: range(&field.time_codes()),
         frames_per_second: field.timeline.frames_per_second,
         cameras: field.cameras.iter().map(|camera| camera.name.clone()).collect(),
         r#box: corners(&means),

@@ -550,9 +550,8 @@ fn given_views(command: &Render, field: &Field, outputs: &mut Outputs) -> Result
     let Some(capture) = &command.capture else {
         return Err(Error::usage("no views", "give --capture, --camera or --path"));
     };
-    let mut options = command.capture_options.clone();
+    let mut options = command.capture_options.as_trained(field);
     options.no_masks = options.masks.is_none();
-    options.downscale = options.downscale.or(scene::trained_downscale(field));
     let dataset = options.open(capture)?;
     outputs.reads_capture(&dataset)?;
     print_warnings(&dataset);

@@ -40,6 +40,10 @@ pub(in crate::commands) struct FrameOptions {
     /// Frames taken of each video of the capture, at most [default: 300]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub(in crate::commands) video_frames: Option<u32>,
+    /// Read a window of time of a long capture alone, with some frames of its neighbours, as in --window 2/4 for the
+    /// second of four [default: that of the scene]
+    #[arg(long, value_name = "K/N")]
+    pub(in crate::commands) window: Option<cif_dataset::TimeWindow>,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -78,11 +82,20 @@ impl CaptureOptions {
         Self {
             masks: None,
             no_masks: true,
-            downscale: downscale.or(scene::trained_downscale(field)),
+            downscale,
             center_principal_point: false,
             layout,
             frames: frames.clone(),
         }
+        .as_trained(field)
+    }
+
+    /// The reduction of images and the window of time that a scene was trained with, where these options do not say.
+    pub(in crate::commands) fn as_trained(&self, field: &cif_field::Field) -> Self {
+        let mut options = self.clone();
+        options.downscale = options.downscale.or(scene::trained_downscale(field));
+        options.frames.window = options.frames.window.or(field.record.window);
+        options
     }
 
     pub(in crate::commands) fn options(&self) -> cif_dataset::OpenOptions {
@@ -95,6 +108,7 @@ impl CaptureOptions {
             layout: self.layout.map(Into::into),
             without_cameras: self.frames.without_camera.clone(),
             video_frames: self.frames.video_frames,
+            window: self.frames.window,
         }
     }
 

@@ -17,7 +17,6 @@ use cif_train::{
 use clap::{Args, ValueEnum};
 
 use super::shared::named::{HeadArgument, preset};
-use super::shared::scene;
 use super::shared::simd::Simd;
 use crate::commands::shared::{CaptureOptions, command_line, print_warnings};
 use crate::destination::{Destination, Existing};
@@ -258,12 +257,14 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     #[cfg(feature = "wgpu")]
     let gpu = command.backend.open()?;
 
-    let mut capture = command.capture_options.clone();
-    let wanted = match &checkpoint {
-        Some(checkpoint) => scene::trained_downscale(&checkpoint.field),
-        None => resolve(command, base.as_ref(), layout, None)?.downscale,
+    let mut capture = match checkpoint.as_ref().or(source.as_ref()) {
+        Some(begun) => command.capture_options.as_trained(&begun.field),
+        None => command.capture_options.clone(),
     };
-    capture.downscale = capture.downscale.or(wanted);
+    if checkpoint.is_none() {
+        let wanted = resolve(command, base.as_ref(), layout, None)?.downscale;
+        capture.downscale = command.capture_options.downscale.or(wanted);
+    }
     let phase = phases.enter(Phase::Open, 0);
     let mut dataset = capture.open(&command.capture)?;
     drop(phase);
@@ -459,6 +460,9 @@ fn resume_command(command: &Train) -> String {
     }
     if let Some(frames) = capture.frames.video_frames {
         option("--video-frames", frames.to_string());
+    }
+    if let Some(window) = capture.frames.window {
+        option("--window", window.to_string());
     }
     #[cfg(feature = "wgpu")]
     if command.backend != super::backend::Backend::Cpu {

@@ -101,8 +101,7 @@ fn of_scene(
     graph: &SceneGraph,
     field: Option<&Field>,
 ) -> Result<Dataset, Error> {
-    let mut options = options.clone();
-    options.downscale = options.downscale.or_else(|| field.and_then(scene::trained_downscale));
+    let options = field.map_or_else(|| options.clone(), |field| options.as_trained(field));
     let dataset = options.open(capture)?;
     print_warnings(&dataset);
     if let Some(field) = field {

@@ -150,6 +150,7 @@ fn open(command: &Propagate) -> Result<Dataset, Error> {
         layout: command.layout.map(Into::into),
         without_cameras: command.frames.without_camera.clone(),
         video_frames: command.frames.video_frames,
+        window: command.frames.window,
         ..OpenOptions::default()
     };
     let dataset = Dataset::open(&command.capture, &options).map_err(Error::plain)?;
