@@ -3,11 +3,12 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use cif_geometry::TimeWindow;
 use cif_system::Error;
 
 use crate::job::{Batch, Job, Step};
 use crate::plan::{Each, Plan, check_name};
-use crate::steps::{COLLECT, Template, templates};
+use crate::steps::{COLLECT, SCENES, Template, templates};
 
 /// A part of a bench that is a job of its own.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -38,6 +39,16 @@ struct Run {
     capture: usize,
     /// Options of its training.
     words: Vec<String>,
+    /// The scene that it is a window of, by index; each is its own where there are no windows.
+    whole: usize,
+}
+
+/// Runs that are the windows of one scene, in the order of time.
+#[derive(Clone, Debug)]
+struct Whole {
+    name: String,
+    capture: usize,
+    runs: std::ops::Range<usize>,
 }
 
 /// A capture.
@@ -55,6 +66,7 @@ struct Capture {
 pub fn expand(plan: &Plan, benches: &dyn Benches) -> Result<Batch, Error> {
     let captures = captures(plan)?;
     let runs = runs(plan, &captures);
+    let wholes = wholes(&runs);
     let mut batch = Batch {
         name: plan.file.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
         plan: plan.file.clone(),
@@ -75,6 +87,9 @@ pub fn expand(plan: &Plan, benches: &dyn Benches) -> Result<Batch, Error> {
             Each::Run => {
                 runs.iter().enumerate().map(|(k, run)| Subject::of_run(plan, &captures, k, run)).collect()
             }
+            Each::Whole => (0..wholes.len())
+                .map(|k| Subject::of_whole(plan, &captures, (k, &wholes[k]), &runs))
+                .collect(),
             Each::Capture => captures
                 .iter()
                 .enumerate()
@@ -87,7 +102,7 @@ pub fn expand(plan: &Plan, benches: &dyn Benches) -> Result<Batch, Error> {
             let mut job = job(plan, &template, subject, batch.steps.len())?;
             for need in &needs {
                 let jobs = batch.steps[*need].jobs.clone();
-                job.needs.extend(match_jobs(each_of[*need], jobs, subject, &runs));
+                job.needs.extend(match_jobs(each_of[*need], jobs, subject, &runs, &wholes));
             }
             batch.jobs.push(job);
         }
@@ -191,17 +206,48 @@ fn runs(plan: &Plan, captures: &[Capture]) -> Vec<Run> {
         };
         settings = settings.iter().flat_map(extended).collect();
     }
-    let of_capture = |(capture, of): (usize, &Capture)| {
-        let name = of.name.clone();
-        settings
-            .iter()
-            .map(move |(names, words)| {
-                let setting = if names.is_empty() { "run".to_owned() } else { names.join(".") };
-                Run { name: format!("{name}/{setting}"), capture, words: words.clone() }
-            })
-            .collect::<Vec<_>>()
+    let windows: Vec<Option<TimeWindow>> = match plan.train.windows {
+        0 => vec![None],
+        count => TimeWindow::all(count).map(Some).collect(),
     };
-    captures.iter().enumerate().flat_map(of_capture).collect()
+    let mut runs = Vec::new();
+    for (place, (capture, (names, words))) in (0..captures.len())
+        .flat_map(|capture| settings.iter().map(move |setting| (capture, setting)))
+        .enumerate()
+    {
+        let setting = if names.is_empty() { "run".to_owned() } else { names.join(".") };
+        let name = format!("{}/{setting}", captures[capture].name);
+        for window in &windows {
+            let mut run = Run { name: name.clone(), capture, words: words.clone(), whole: place };
+            if let Some(window) = window {
+                // Folders are in the order of time, whatever lists them.
+                run.name += &format!(".{WINDOW}{:03}", window.number());
+                run.words.extend(["--window".to_owned(), window.to_string()]);
+            }
+            runs.push(run);
+        }
+    }
+    runs
+}
+
+/// Begin of the last part of the name of a window, as in `walk/draft.window002`.
+const WINDOW: &str = "window";
+
+/// The scenes that runs are windows of.
+fn wholes(runs: &[Run]) -> Vec<Whole> {
+    let mut wholes: Vec<Whole> = Vec::new();
+    for (index, run) in runs.iter().enumerate() {
+        match wholes.get_mut(run.whole) {
+            Some(whole) => whole.runs.end = index + 1,
+            None => {
+                let name = run.name.rsplit_once(&format!(".{WINDOW}"));
+                let name = name.filter(|_| run.words.iter().any(|word| word == "--window"));
+                let name = name.map_or(run.name.as_str(), |(name, _)| name).to_owned();
+                wholes.push(Whole { name, capture: run.capture, runs: index..index + 1 });
+            }
+        }
+    }
+    wholes
 }
 
 /// The scene, capture or batch that a job works on.
@@ -209,6 +255,9 @@ struct Subject<'a> {
     name: String,
     capture: Option<usize>,
     run: Option<(usize, &'a Run)>,
+    whole: Option<usize>,
+    /// Files of the scenes that it works on.
+    scenes: Vec<String>,
     path: Option<&'a Path>,
     /// Values of placeholders.
     values: BTreeMap<&'static str, String>,
@@ -217,7 +266,8 @@ struct Subject<'a> {
 impl<'a> Subject<'a> {
     fn of_batch(plan: &Plan) -> Self {
         let values = BTreeMap::from([("output", plan.output.display().to_string())]);
-        Self { name: String::new(), capture: None, run: None, path: None, values }
+        let scenes = Vec::new();
+        Self { name: String::new(), capture: None, run: None, whole: None, scenes, path: None, values }
     }
 
     fn of_capture(plan: &Plan, index: usize, capture: &'a Capture) -> Self {
@@ -231,11 +281,23 @@ impl<'a> Subject<'a> {
 
     fn of_run(plan: &Plan, captures: &'a [Capture], index: usize, run: &'a Run) -> Self {
         let mut subject = Self::of_capture(plan, run.capture, &captures[run.capture]);
-        let folder = plan.output.join("scenes").join(&run.name);
-        subject.values.insert("scene", folder.join("scene.cif").display().to_string());
+        let (folder, scene) = (folder_of(plan, &run.name), scene_of(plan, &run.name));
+        subject.values.insert("scene", scene.clone());
         subject.values.insert("folder", folder.display().to_string());
         subject.values.insert("name", run.name.clone());
-        Self { name: run.name.clone(), run: Some((index, run)), ..subject }
+        let (name, run) = (run.name.clone(), Some((index, run)));
+        Self { name, run, whole: run.map(|(_, run)| run.whole), scenes: vec![scene], ..subject }
+    }
+
+    fn of_whole(plan: &Plan, captures: &'a [Capture], (index, whole): (usize, &Whole), runs: &[Run]) -> Self {
+        let mut subject = Self::of_capture(plan, whole.capture, &captures[whole.capture]);
+        subject.scenes = runs[whole.runs.clone()].iter().map(|run| scene_of(plan, &run.name)).collect();
+        if let [scene] = subject.scenes.as_slice() {
+            subject.values.insert("scene", scene.clone());
+        }
+        subject.values.insert("folder", folder_of(plan, &whole.name).display().to_string());
+        subject.values.insert("name", whole.name.clone());
+        Self { name: whole.name.clone(), whole: Some(index), ..subject }
     }
 
     /// A text with the values in place of the placeholders.
@@ -255,6 +317,15 @@ impl<'a> Subject<'a> {
     }
 }
 
+/// Folder of the results of a scene.
+fn folder_of(plan: &Plan, name: &str) -> PathBuf {
+    plan.output.join("scenes").join(name)
+}
+
+fn scene_of(plan: &Plan, name: &str) -> String {
+    folder_of(plan, name).join("scene.cif").display().to_string()
+}
+
 fn job(plan: &Plan, template: &Template, subject: &Subject<'_>, step: usize) -> Result<Job, Error> {
     let fill = |text: &String| {
         subject.fill(text).map_err(|problem| {
@@ -262,7 +333,13 @@ fn job(plan: &Plan, template: &Template, subject: &Subject<'_>, step: usize) -> 
             Error::refused(problem, "a brace that is no placeholder cannot stand in a plan")
         })
     };
-    let mut words = template.words.iter().map(fill).collect::<Result<Vec<_>, _>>()?;
+    let mut words = Vec::with_capacity(template.words.len());
+    for word in &template.words {
+        match word.as_str() {
+            SCENES if !subject.scenes.is_empty() => words.extend(subject.scenes.iter().cloned()),
+            _ => words.push(fill(word)?),
+        }
+    }
     if template.goes_on
         && let Some((_, run)) = subject.run
     {
@@ -287,13 +364,24 @@ fn job(plan: &Plan, template: &Template, subject: &Subject<'_>, step: usize) -> 
 }
 
 /// Jobs of a needed step that belong to what a job works on.
-fn match_jobs(each: Each, jobs: std::ops::Range<usize>, subject: &Subject<'_>, runs: &[Run]) -> Vec<usize> {
-    match (each, subject.run, subject.capture) {
-        (Each::Run, Some((run, _)), _) => vec![jobs.start + run],
-        (Each::Capture, _, Some(capture)) => vec![jobs.start + capture],
-        (Each::Run, None, Some(capture)) => {
-            jobs.zip(runs).filter(|(_, run)| run.capture == capture).map(|(job, _)| job).collect()
-        }
+fn match_jobs(
+    each: Each,
+    jobs: std::ops::Range<usize>,
+    subject: &Subject<'_>,
+    runs: &[Run],
+    wholes: &[Whole],
+) -> Vec<usize> {
+    match (each, subject.capture) {
+        (Each::Run, Some(capture)) => match (subject.run, subject.whole) {
+            (Some((run, _)), _) => vec![jobs.start + run],
+            (None, Some(whole)) => wholes[whole].runs.clone().map(|run| jobs.start + run).collect(),
+            _ => jobs.zip(runs).filter(|(_, run)| run.capture == capture).map(|(job, _)| job).collect(),
+        },
+        (Each::Whole, Some(capture)) => match subject.whole {
+            Some(whole) => vec![jobs.start + whole],
+            None => jobs.zip(wholes).filter(|(_, of)| of.capture == capture).map(|(job, _)| job).collect(),
+        },
+        (Each::Capture, Some(capture)) => vec![jobs.start + capture],
         _ => jobs.collect(),
     }
 }
@@ -421,6 +509,40 @@ mod tests {
         for (k, job) in batch.jobs.iter().enumerate() {
             assert!(job.needs.iter().all(|need| *need < k), "{} comes before what it needs", job.id);
         }
+    }
+
+    #[test]
+    fn windows_are_trained_and_scored_one_by_one_and_exported_together() {
+        let batch = batch(
+            "captures = ['captures/*']\n[train]\nseed = [0, 1]\nwindows = 2\n[export]\nfiles = ['scene.usda']\n\
+             [[step]]\nname = 'sheet'\neach = 'whole'\nneeds = ['eval']\ncommand = 'info {folder}'\n\
+             [[step]]\nname = 'page'\neach = 'capture'\nneeds = ['export']\ncommand = 'info {capture}'\n",
+        )
+        .unwrap();
+        let sizes: Vec<(&str, usize)> =
+            batch.steps.iter().map(|step| (step.name.as_str(), step.jobs.len())).collect();
+        assert_eq!(
+            sizes,
+            [("train", 8), ("eval", 8), ("export", 4), ("sheet", 4), ("page", 2), ("collect", 1)]
+        );
+        let train = &batch.jobs[batch.named("train/b/seed1.window002").unwrap().start];
+        assert!(train.words.join(" ").ends_with("--seed 1 --window 2/2"), "{:?}", train.words);
+        let export = &batch.jobs[batch.named("export/b/seed1").unwrap().start];
+        let folder = "results/scenes/b/seed1";
+        assert_eq!(
+            export.words.join(" "),
+            format!(
+                "export {folder}.window001/scene.cif {folder}.window002/scene.cif {folder}/scene.usda --force"
+            )
+        );
+        let windows = ["train/b/seed1.window001", "train/b/seed1.window002"];
+        assert_eq!(ids(&batch, &export.needs), windows);
+        let sheet = &batch.jobs[batch.named("sheet/b/seed1").unwrap().start];
+        assert_eq!(sheet.words, ["info", folder]);
+        let scored = ["eval/b/seed1.window001", "eval/b/seed1.window002"];
+        assert_eq!(ids(&batch, &sheet.needs), [&scored[..], &windows[..]].concat());
+        let page = &batch.jobs[batch.named("page/b").unwrap().start];
+        assert_eq!(ids(&batch, &page.needs), ["export/b/seed0", "export/b/seed1"]);
     }
 
     #[test]

@@ -10,6 +10,9 @@ use serde::Deserialize;
 /// Largest plan that is read, bytes.
 const LARGEST: u64 = 4 << 20;
 
+/// Most windows of time: their numbers have three digits.
+const MOST_WINDOWS: u32 = 999;
+
 /// A plan. Paths are relative to the folder of its file.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -110,6 +113,9 @@ pub struct Train {
     /// Seeds.
     #[serde(default)]
     pub seed: Vec<u32>,
+    /// Windows of time that captures are divided into, each trained by itself; 0 for none.
+    #[serde(default)]
+    pub windows: u32,
     /// Options of every run.
     #[serde(default)]
     pub options: Words,
@@ -149,9 +155,11 @@ pub struct Export {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Each {
-    /// Every trained scene.
+    /// Every trained scene; of a capture that is divided into windows of time, each of them.
     #[default]
     Run,
+    /// All windows of a scene together; every trained scene where there are none.
+    Whole,
     /// Every capture.
     Capture,
     /// Once.
@@ -279,6 +287,9 @@ impl Plan {
         for name in named.chain(self.bench.iter().map(|bench| bench.name.as_str())) {
             check_name(name)?;
         }
+        if self.train.windows == 1 || self.train.windows > MOST_WINDOWS {
+            return Err(format!("windows must be 2 to {MOST_WINDOWS}"));
+        }
         let own = self.step.iter().map(|step| &step.resources);
         for resources in own.chain([&self.resources]) {
             if resources.threads == Some(0) {
@@ -340,6 +351,7 @@ mod tests {
             ("captures = ['a']\n[train]\nseed = [1, 1]", "listed twice"),
             ("captures = ['a']\n[variants]\n'../up' = []", "cannot be a name"),
             ("captures = ['a']\n[resources]\nthreads = 0", "1 or more"),
+            ("captures = ['a']\n[train]\nwindows = 1", "2 to 999"),
             ("captures = ['a']\n[resources]\nmemory_gib = -1.0", "above 0"),
             ("captures = ['a']\n[train]\noptions = \"--set 'x\"", "not closed"),
             ("output = 'x'", "nothing to do"),

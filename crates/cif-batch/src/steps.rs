@@ -13,6 +13,9 @@ pub const EXPORT: &str = "export";
 /// The page over all.
 pub const COLLECT: &str = "collect";
 
+/// Word of a command that stands for all windows of a scene, each a word of its own.
+pub(crate) const SCENES: &str = "{scenes}";
+
 /// A step.
 #[derive(Clone, Debug)]
 pub(crate) struct Template {
@@ -70,15 +73,15 @@ pub(crate) fn templates(plan: &Plan) -> Result<Vec<Template>, Error> {
         }
         if let Some(export) = &plan.export {
             let files: Vec<String> = export.files.iter().map(|file| format!("{{folder}}/{file}")).collect();
-            let mut words = texts(&["export", "{scene}"]);
+            let mut words = texts(&["export", SCENES]);
             words.extend(files.iter().cloned());
             words.extend(texts(&["--force"]).into_iter().chain(export.options.0.iter().cloned()));
-            steps.push(after_training(EXPORT, words, files, plan));
+            steps.push(Template { each: Each::Whole, ..after_training(EXPORT, words, files, plan) });
         }
     }
     for own in &plan.step {
         let mut needs = own.needs.clone();
-        if own.each == Each::Run && !needs.iter().any(|name| name == TRAIN) {
+        if matches!(own.each, Each::Run | Each::Whole) && !needs.iter().any(|name| name == TRAIN) {
             needs.push(TRAIN.to_owned());
         }
         steps.push(Template {

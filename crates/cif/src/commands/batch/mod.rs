@@ -39,6 +39,7 @@ jobs that it needs. Paths are relative to the plan. The whole of it, where every
   preset = [\"draft\", \"standard\"]
   head = [\"cif\", \"sa4d\"]
   seed = [0, 1, 2]
+  windows = 4                            # of time, for long captures: trained one by one, exported as one stage
   options = \"--max-gaussians 20000\"
   needs = [\"masks\"]                      # steps that come first
 
@@ -56,7 +57,7 @@ jobs that it needs. Paths are relative to the plan. The whole of it, where every
 
   [[step]]                               # commands of your own
   name = \"film\"
-  each = \"run\"                           # every scene; or \"capture\", or \"batch\" for once
+  each = \"run\"                           # every scene; or \"whole\" for all its windows, \"capture\", \"batch\" for once
   command = \"render {scene} --path orbit -o {folder}/orbit.mp4\"
   makes = [\"{folder}/orbit.mp4\"]
   needs = [\"eval\"]
@@ -74,7 +75,7 @@ jobs that it needs. Paths are relative to the plan. The whole of it, where every
   command = \"/shared/cif/bin/cif\"        # on the workers
   slurm = \"--partition=cpu\"
 
-Placeholders: {capture}, {name}, {folder}, {scene}, {output}.
+Placeholders: {capture}, {name}, {folder}, {scene}, {output}; the word {scenes} is the files of all windows of a scene.
 
   cif batch plan.toml --list                     which jobs there are, and which are done
   cif batch plan.toml                            run them here; the same command goes on after a stop

@@ -5,7 +5,7 @@ mod record;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-use cif_dataset::{Dataset, MadeFrom, OpenOptions};
+use cif_dataset::{Dataset, MadeFrom, OpenOptions, TimeWindow};
 use cif_field::Checkpoint;
 use clap::Args;
 use serde::Serialize;
@@ -42,7 +42,8 @@ make did not write, or that were changed since, are never replaced.
   cif make phone.mp4 -o table
   cif make left.mp4 right.mp4 -o rig --preset draft
   cif make captures/table -o table                    a capture that has masks: train and export
-  cif make captures/table -o table --masks tracked    masks of a tracker (cif masks import)")]
+  cif make captures/table -o table --masks tracked    masks of a tracker (cif masks import)
+  cif make captures/walk -o walk --windows 4          a long capture, window by window of time, as one stage")]
 pub(super) struct Make {
     /// Videos and folders of photographs, as `cif capture` takes them, or the folder of one capture
     #[arg(required = true, value_name = "INPUT")]
@@ -65,6 +66,11 @@ pub(super) struct Make {
     /// Settings file of the training
     #[arg(long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
+    /// Divide a long capture by time, train each window by itself (scene.window001.cif and so on), and export them as one
+    /// stage, in which every object keeps one path
+    #[cfg(feature = "usd")]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..=999))]
+    windows: Option<u32>,
     #[command(flatten)]
     report: OnlyReport,
     #[arg(from_global)]
@@ -78,7 +84,7 @@ struct MakeReport<'a> {
     capture: &'a Path,
     /// Folder of the masks; null where the capture has its own.
     masks: Option<&'a Path>,
-    /// The trained scene.
+    /// The trained scene, or that of the first window of time.
     scene: &'a Path,
     /// The exported stage, or glTF file in builds without USD.
     stage: &'a Path,
@@ -103,25 +109,36 @@ pub(super) fn run(command: &Make, run_line: RunLine) -> Result<(), Error> {
     let mut record = Record::read(&command.output)?;
     let capture = command.capture(&mut record, run_line)?;
     let masks = command.masks(&capture, &mut record, run_line)?;
-    let scene = command.train(&capture, masks.as_deref(), &mut record, run_line)?;
+    let mut scenes = Vec::new();
+    for window in command.windows() {
+        scenes.push(command.train(&capture, masks.as_deref(), window, &mut record, run_line)?);
+    }
     let (flag, name) = STAGE;
     let stage = command.output.join(name);
     let mut made_from = version();
-    made_from.files([("the scene".to_owned(), scene.clone())], record.known("stage"));
-    let state = record.state("stage", &stage, &made_from, &[&scene])?;
+    let named = |scene: &PathBuf| match scenes.len() {
+        1 => "the scene".to_owned(),
+        _ => format!("the scene {}", scene.file_name().unwrap_or_default().to_string_lossy()),
+    };
+    made_from.files(scenes.iter().map(|scene| (named(scene), scene.clone())), record.known("stage"));
+    let results: Vec<&Path> = scenes.iter().map(PathBuf::as_path).collect();
+    let state = record.state("stage", &stage, &made_from, &results)?;
     if !is_made(&state, &stage) {
         record.begin("stage", &stage, made_from)?;
-        let mut words: Vec<OsString> =
-            vec!["export".into(), scene.clone().into(), flag.into(), stage.clone().into()];
-        words.extend(["--check".into(), "--capture".into(), capture.clone().into()]);
-        if let Some(masks) = &masks {
-            words.extend(["--masks".into(), masks.clone().into()]);
+        let mut words: Vec<OsString> = vec!["export".into()];
+        words.extend(scenes.iter().map(OsString::from));
+        words.extend([flag.into(), stage.clone().into()]);
+        if scenes.len() == 1 {
+            words.extend(["--check".into(), "--capture".into(), capture.clone().into()]);
+            if let Some(masks) = &masks {
+                words.extend(["--masks".into(), masks.clone().into()]);
+            }
         }
         words.extend(matches!(state, State::Stale(_)).then(|| "--force".into()));
         step(run_line, words, None)?;
         record.end("stage", &stage)?;
     }
-    let report = MakeReport { capture: &capture, masks: masks.as_deref(), scene: &scene, stage: &stage };
+    let report = MakeReport { capture: &capture, masks: masks.as_deref(), scene: &scenes[0], stage: &stage };
     command.report.give(
         || report,
         || {
@@ -223,22 +240,36 @@ impl Make {
         std::path::absolute(&place).map(Some).map_err(Error::io("find", &place))
     }
 
+    /// Windows of time, each of which is trained; `None` for all of the capture.
+    fn windows(&self) -> Vec<Option<TimeWindow>> {
+        #[cfg(feature = "usd")]
+        if let Some(count) = self.windows {
+            return TimeWindow::all(count).map(Some).collect();
+        }
+        vec![None]
+    }
+
     /// The trained scene; a run that was interrupted goes on.
     fn train(
         &self,
         capture: &Path,
         masks: Option<&Path>,
+        window: Option<TimeWindow>,
         record: &mut Record,
         run_line: RunLine,
     ) -> Result<PathBuf, Error> {
-        let scene = self.output.join("scene.cif");
-        let options = OpenOptions { masks: masks.map(Path::to_owned), ..OpenOptions::default() };
+        let name = match window {
+            Some(window) => format!("scene.window{:03}", window.number()),
+            None => "scene".to_owned(),
+        };
+        let (name, scene) = (name.as_str(), self.output.join(format!("{name}.cif")));
+        let options = OpenOptions { masks: masks.map(Path::to_owned), window, ..OpenOptions::default() };
         let dataset = Dataset::open(capture, &options).map_err(Error::plain)?;
         let mut made_from = version();
-        made_from.capture(&dataset, record.known("scene")).value("preset", &self.preset);
+        made_from.capture(&dataset, record.known(name)).value("preset", &self.preset);
         let config = self.config.iter().map(|file| ("the settings file".to_owned(), file.clone()));
-        made_from.files(config, record.known("scene"));
-        let state = record.state("scene", &scene, &made_from, masks.as_slice())?;
+        made_from.files(config, record.known(name));
+        let state = record.state(name, &scene, &made_from, masks.as_slice())?;
         let begun = is_made(&state, &scene);
         if begun && Checkpoint::load(&scene).map_err(Error::plain)?.training.is_none() {
             return Ok(scene);
@@ -249,11 +280,14 @@ impl Make {
         if let Some(masks) = masks {
             words.extend(["--masks".into(), masks.into()]);
         }
+        if let Some(window) = window {
+            words.extend(["--window".into(), window.to_string().into()]);
+        }
         if begun {
-            record.go_on("scene", made_from)?;
+            record.go_on(name, made_from)?;
             words.push("--resume".into());
         } else {
-            record.begin("scene", &scene, made_from)?;
+            record.begin(name, &scene, made_from)?;
             let of = |name: &str, value: Option<OsString>| value.map(|value| [name.into(), value]);
             let preset = of("--preset", self.preset.as_ref().map(OsString::from));
             let config = of("--config", self.config.as_ref().map(OsString::from));
@@ -261,7 +295,7 @@ impl Make {
             words.extend(matches!(state, State::Stale(_)).then(|| "--force".into()));
         }
         step(run_line, self.quietly(words), None)?;
-        record.end("scene", &scene)?;
+        record.end(name, &scene)?;
         Ok(scene)
     }
 
