@@ -54,6 +54,7 @@ def test_each_window_is_scored_on_its_own_frames(batch: Path) -> None:
 
 
 def test_the_stage_has_one_path_of_each_object_and_splats_of_each_window(batch: Path) -> None:
+    assert "walk.usda" in (batch.parents[1] / "index.html").read_text()
     stage = Usd.Stage.Open(str(batch / "run" / "walk.usda"))
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0, 71)
     splats = [prim for prim in stage.Traverse() if prim.GetTypeName() == "ParticleField3DGaussianSplat"]

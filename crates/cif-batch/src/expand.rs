@@ -65,8 +65,7 @@ struct Capture {
 /// When no folder is where captures are to be, two have one name, or steps do not fit together.
 pub fn expand(plan: &Plan, benches: &dyn Benches) -> Result<Batch, Error> {
     let captures = captures(plan)?;
-    let runs = runs(plan, &captures);
-    let wholes = wholes(&runs);
+    let (runs, wholes) = runs(plan, &captures);
     let mut batch = Batch {
         name: plan.file.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
         plan: plan.file.clone(),
@@ -183,8 +182,9 @@ fn captures(plan: &Plan) -> Result<Vec<Capture>, Error> {
     Ok(found)
 }
 
-/// A value of each axis of a plan; an axis that it does not name has none.
-fn runs(plan: &Plan, captures: &[Capture]) -> Vec<Run> {
+/// A run for every value of each axis of a plan, of which one that it does not name has none, and for every window of time;
+/// and the scenes that they are windows of.
+fn runs(plan: &Plan, captures: &[Capture]) -> (Vec<Run>, Vec<Whole>) {
     let mut settings: Vec<(Vec<String>, Vec<String>)> = vec![Default::default()];
     let flag = |flag: &str, values: &[String]| -> Vec<(String, Vec<String>)> {
         values.iter().map(|value| (value.clone(), vec![flag.to_owned(), value.clone()])).collect()
@@ -210,45 +210,28 @@ fn runs(plan: &Plan, captures: &[Capture]) -> Vec<Run> {
         0 => vec![None],
         count => TimeWindow::all(count).map(Some).collect(),
     };
-    let mut runs = Vec::new();
-    for (place, (capture, (names, words))) in (0..captures.len())
-        .flat_map(|capture| settings.iter().map(move |setting| (capture, setting)))
-        .enumerate()
-    {
-        let setting = if names.is_empty() { "run".to_owned() } else { names.join(".") };
-        let name = format!("{}/{setting}", captures[capture].name);
-        for window in &windows {
-            let mut run = Run { name: name.clone(), capture, words: words.clone(), whole: place };
-            if let Some(window) = window {
-                // Folders are in the order of time, whatever lists them.
-                run.name += &format!(".{WINDOW}{:03}", window.number());
-                run.words.extend(["--window".to_owned(), window.to_string()]);
+    let (mut runs, mut wholes) = (Vec::new(), Vec::new());
+    for (capture, of) in captures.iter().enumerate() {
+        for (names, words) in &settings {
+            let setting = if names.is_empty() { "run".to_owned() } else { names.join(".") };
+            let (name, whole, first) = (format!("{}/{setting}", of.name), wholes.len(), runs.len());
+            for window in &windows {
+                let mut run = Run { name: name.clone(), capture, words: words.clone(), whole };
+                if let Some(window) = window {
+                    // Folders are in the order of time, whatever lists them.
+                    run.name += &format!("{WINDOW}{:03}", window.number());
+                    run.words.extend(["--window".to_owned(), window.to_string()]);
+                }
+                runs.push(run);
             }
-            runs.push(run);
+            wholes.push(Whole { name, capture, runs: first..runs.len() });
         }
     }
-    runs
+    (runs, wholes)
 }
 
-/// Begin of the last part of the name of a window, as in `walk/draft.window002`.
-const WINDOW: &str = "window";
-
-/// The scenes that runs are windows of.
-fn wholes(runs: &[Run]) -> Vec<Whole> {
-    let mut wholes: Vec<Whole> = Vec::new();
-    for (index, run) in runs.iter().enumerate() {
-        match wholes.get_mut(run.whole) {
-            Some(whole) => whole.runs.end = index + 1,
-            None => {
-                let name = run.name.rsplit_once(&format!(".{WINDOW}"));
-                let name = name.filter(|_| run.words.iter().any(|word| word == "--window"));
-                let name = name.map_or(run.name.as_str(), |(name, _)| name).to_owned();
-                wholes.push(Whole { name, capture: run.capture, runs: index..index + 1 });
-            }
-        }
-    }
-    wholes
-}
+/// Stands between the name of a scene and the number of a window of it, as in `walk/draft.window002`.
+pub const WINDOW: &str = ".window";
 
 /// The scene, capture or batch that a job works on.
 struct Subject<'a> {

@@ -24,6 +24,6 @@ pub mod simulate;
 pub mod steps;
 
 pub use cif_system::Error;
-pub use expand::{Benches, Part, expand};
+pub use expand::{Benches, Part, WINDOW, expand};
 pub use job::{Batch, Job, Step};
 pub use plan::Plan;

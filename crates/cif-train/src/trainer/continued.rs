@@ -1,7 +1,7 @@
 //! Poses at times of the capture that no training frame shows: before the first and after the last of them, as where
 //! every eighth frame is held out, and before an object comes into the images or after it has left them.
 
-use cif_dataset::{Dataset, Split};
+use cif_dataset::Frame;
 use cif_field::Tracks;
 use cif_field::tracks::TrackPose;
 use cif_render::Gradients;
@@ -20,9 +20,8 @@ struct Span {
 
 impl Span {
     /// `None` without two times of training frames.
-    fn of(dataset: &Dataset) -> Option<Self> {
-        let training = dataset.frames.iter().filter(|frame| frame.split == Split::Train);
-        let mut times: Vec<f64> = training.map(|frame| frame.time).collect();
+    fn of(trained: &[&Frame]) -> Option<Self> {
+        let mut times: Vec<f64> = trained.iter().map(|frame| frame.time).collect();
         times.sort_by(f64::total_cmp);
         let reach = times.windows(2).map(|pair| pair[1] - pair[0]).fold(0.0, f64::max);
         let (first, last) = (*times.first()?, *times.last()?);
@@ -113,15 +112,16 @@ impl Trainer {
     /// Continues the motion of objects to the times of the capture at which no training frame shows them.
     pub(super) fn continue_poses(&mut self) {
         let state = &mut self.state;
-        let Some(span) = Span::of(&state.dataset) else { return };
+        // Without those that were left out for their masks, which say nothing of where objects are.
+        let trained: Vec<&Frame> =
+            (0..state.frames.len()).map(|k| &state.dataset.frames[state.frames.index(k)]).collect();
+        let Some(span) = Span::of(&trained) else { return };
         let Some(tracks) = &mut state.field.tracks else { return };
-        let (frames, times) = (&state.dataset.frames, &state.dataset.times);
         let is_in_view = |pose: &TrackPose| {
-            let mut then =
-                frames.iter().filter(|frame| frame.split == Split::Train && frame.time == pose.time);
+            let mut then = trained.iter().filter(|frame| frame.time == pose.time);
             then.any(|frame| frame.camera.pixel_of(pose.translation).is_some())
         };
-        if continue_tracks(tracks, &mut state.pose_moments, (&span, times), is_in_view) {
+        if continue_tracks(tracks, &mut state.pose_moments, (&span, &state.dataset.times), is_in_view) {
             state.gradients = Gradients::zeros(&state.field);
         }
     }
@@ -129,6 +129,7 @@ impl Trainer {
 
 #[cfg(test)]
 mod tests {
+    use cif_dataset::Split;
     use cif_field::Gaussians;
     use cif_field::tracks::TrackGroup;
     use glam::DVec3;
@@ -149,6 +150,18 @@ mod tests {
             rotation: DQuat::from_rotation_z(3.0 * time),
         };
         TrackGroup { poses: times.iter().map(pose).collect(), ..TrackGroup::still("a", DVec3::ZERO) }
+    }
+
+    #[test]
+    fn frames_that_were_left_out_show_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), Scene { times: 4, views: 2, ..Scene::default() });
+        let ends = |trained: &[&Frame]| Span::of(trained).map(|span| (span.first, span.last));
+        let all: Vec<&Frame> = dataset.frames.iter().collect();
+        assert_eq!(ends(&all), Some((dataset.times[0], dataset.times[3])));
+        let later: Vec<&Frame> = all.iter().copied().filter(|frame| frame.time_index > 0).collect();
+        assert_eq!(ends(&later), Some((dataset.times[1], dataset.times[3])));
+        assert_eq!(ends(&all[..1]), None);
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use cif_batch::record::{Record, State};
 use cif_batch::steps::{COLLECT, TRAIN};
-use cif_batch::{Batch, Job};
+use cif_batch::{Batch, Job, WINDOW};
 use cif_bench::batch::{self, Scene, Undone};
 use serde_json::Value;
 
@@ -30,7 +30,9 @@ pub(super) fn collect(plan: &Batch) -> Result<(), Error> {
     }
     let of_training = |job: &Job| {
         let name = job.id.split_once('/')?.1;
-        scene(plan, name, of_scenes.get(name)?)
+        // What all windows of a scene make together is shown with each.
+        let whole = name.rsplit_once(WINDOW).and_then(|(whole, _)| of_scenes.get(whole));
+        scene(plan, name, of_scenes.get(name)?, whole.map_or(&[], Vec::as_slice))
     };
     let trainings = plan.jobs.iter().filter(|job| plan.steps[job.step].name == TRAIN);
     let scenes: Vec<Scene> = trainings.filter_map(of_training).collect();
@@ -55,8 +57,8 @@ fn beside_page(plan: &Batch, path: &Path) -> PathBuf {
     path.strip_prefix(&plan.output).unwrap_or(path).to_owned()
 }
 
-/// A scene, of the jobs that work on it; `None` where none was begun.
-fn scene(plan: &Batch, name: &str, own: &[&Job]) -> Option<Scene> {
+/// A scene, of the jobs that work on it, and of those on all windows that it is one of; `None` where none was begun.
+fn scene(plan: &Batch, name: &str, own: &[&Job], of_whole: &[&Job]) -> Option<Scene> {
     let records: Vec<Record> = own.iter().filter_map(|job| Record::read(plan, job)).collect();
     if records.is_empty() {
         return None;
@@ -70,8 +72,13 @@ fn scene(plan: &Batch, name: &str, own: &[&Job]) -> Option<Scene> {
     let is_shown = |path: &&PathBuf| {
         plan.place(path).is_file() && path.extension().is_none_or(|ending| ending != "json")
     };
-    let files =
-        own.iter().flat_map(|job| &job.makes).filter(is_shown).map(|path| beside_page(plan, path)).collect();
+    let files = own
+        .iter()
+        .chain(of_whole)
+        .flat_map(|job| &job.makes)
+        .filter(is_shown)
+        .map(|path| beside_page(plan, path))
+        .collect();
     Some(Scene {
         capture: capture.to_owned(),
         settings: settings.to_owned(),
