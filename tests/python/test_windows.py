@@ -78,7 +78,13 @@ def test_objects_are_found_and_what_one_scene_cannot_hold_is_refused(batch: Path
     stage = batch / "run" / "walk.usda"
     first, second = (batch / f"run.window00{k}" / "scene.cif" for k in (1, 2))
     assert "red mug" in run("query", stage, "--label", "*")
-    assert "2 windows of time" in run("import", stage, "-o", tmp_path / "a.cif", code=1)
+    assert "--window 1/2" in run("import", stage, "-o", tmp_path / "a.cif", code=1)
+    paths = run("query", stage, "--label", "red mug", "--trajectory", "-").splitlines()
+    assert len([line for line in paths if ",red mug," in line]) == 72
+    run("import", stage, "--window", "2/2", "-o", tmp_path / "second.cif")
+    facts = json.loads(run("info", tmp_path / "second.cif", "--json"))
+    assert facts["time_codes"] == [36, 71]
+    (tmp_path / "second.cif").unlink()
     cases = {
         "give each once": [first, first, "a.usda"],
         "does not hold several windows": [first, second, "a.glb"],

@@ -29,7 +29,7 @@ pub(crate) fn import_scene<'py>(
 ) -> PyResult<(Field, Bound<'py, PyAny>)> {
     let base = base.as_deref();
     let (inner, changes) = process::detach(py, || {
-        let graph = formats::read(&path, ReadOptions::default()).map_err(|error| error.to_string())?;
+        let graph = formats::read(&path, ReadOptions::default(), None).map_err(|error| error.to_string())?;
         let source = name_of(&path);
         match base {
             Some(base) => cif_scene::import_edits(&base.inner, &graph, &source, force_base)

@@ -94,7 +94,7 @@ pub use shape::ground::ground_height;
 pub use shape::level_of_detail::level_of_detail;
 pub use shape::mass::{DENSITY, masses};
 pub use to_field::{field_from_graph, time_in_field};
-pub use windows::{Seam, SeamOfObject, joined};
+pub use windows::{Seam, SeamOfObject, joined, window_alone};
 pub use world::frame_of;
 
 /// Where coordinates lie in the world of the capture; see [`world`].

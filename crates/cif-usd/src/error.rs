@@ -74,17 +74,6 @@ pub enum UsdError {
         /// Given path.
         path: PathBuf,
     },
-    /// A stage of several windows of time, read as one scene.
-    #[error(
-        "{path}: its splats are those of {windows} windows of time, one after the other, which one scene cannot hold; \
-         import a stage that was exported from one of them"
-    )]
-    Windows {
-        /// The stage.
-        path: PathBuf,
-        /// Their number.
-        windows: i64,
-    },
     /// The file to read is missing.
     #[error("{path}: no such file")]
     NotFound {

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use cif_dataset::TimeWindow;
 use cif_field::Field;
 use cif_scene::{ExportOptions, ExportSummary, ReadOptions, SceneFormat, SceneGraph, SceneOptions};
 
@@ -90,11 +91,39 @@ pub fn endings() -> String {
     format!("{} or {last}", all.join(", "))
 }
 
-/// Reads a file of an exchange format as the graph that it holds.
+/// Reads a file of an exchange format as one scene: of a stage of several windows of time, that of `window`.
+///
+/// # Errors
+/// When it has other windows than the one that is asked for, and as [`read_all`].
+pub fn read(path: &Path, options: ReadOptions, window: Option<TimeWindow>) -> Result<SceneGraph, Error> {
+    let graph = read_all(path, options)?;
+    let count = graph.windows.len().max(1);
+    if count == 1 && window.is_none() {
+        return Ok(graph);
+    }
+    let asked = window.filter(|window| window.count() as usize == count);
+    let found = asked.and_then(|window| cif_scene::window_alone(&graph, window.number() as usize - 1));
+    found.ok_or_else(|| {
+        let (file, problem) = (
+            path.display(),
+            match count {
+                1 => "its splats are the same at all times, without windows".to_owned(),
+                _ => format!("its splats are those of {count} windows of time, one after the other"),
+            },
+        );
+        let fix = match count {
+            1 => "leave out --window".to_owned(),
+            _ => format!("take one: --window 1/{count}"),
+        };
+        Error::failed(format!("{file}: {problem}"), fix)
+    })
+}
+
+/// Reads a file of an exchange format as the graph that it holds, with all windows of time.
 ///
 /// # Errors
 /// When the file is missing or broken, is a `.cif`, or its ending is not known.
-pub fn read(path: &Path, options: ReadOptions) -> Result<SceneGraph, Error> {
+pub fn read_all(path: &Path, options: ReadOptions) -> Result<SceneGraph, Error> {
     let advice = || format!("use {}", endings());
     if path.is_dir() {
         return Err(Error::failed(
@@ -150,7 +179,9 @@ pub fn read_both(first: &Path, second: &Path) -> Result<[SceneGraph; 2], Error> 
     }
     let read = |path: &Path| match Content::of(path)? {
         Content::Field => Ok(Read::Field(Box::new(Field::load(path).map_err(Error::plain)?))),
-        Content::Graph(_) => read(path, ReadOptions::default()).map(|graph| Read::Graph(Box::new(graph))),
+        Content::Graph(_) => {
+            read(path, ReadOptions::default(), None).map(|graph| Read::Graph(Box::new(graph)))
+        }
     };
     let both = [read(first)?, read(second)?];
     let options = both.iter().find_map(|one| match one {

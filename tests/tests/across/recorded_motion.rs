@@ -96,7 +96,7 @@ fn exported(field: &Field) -> SceneGraph {
     let folder = tempfile::tempdir().unwrap();
     field.save(folder.path().join("scene.cif")).unwrap();
     run_line(CIF, folder.path(), "export scene.cif scene.glb --tolerance 1000%").succeeds();
-    cif::formats::read(&folder.path().join("scene.glb"), ReadOptions::default()).unwrap()
+    cif::formats::read(&folder.path().join("scene.glb"), ReadOptions::default(), None).unwrap()
 }
 
 /// Holds poses `world_from_local` against those of a group.

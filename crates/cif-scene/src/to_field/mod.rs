@@ -37,8 +37,14 @@ pub(crate) use node::{NodeRows, logit};
 /// did not write get the occupancy of Gaussians that no mask spoke for.
 ///
 /// # Errors
-/// When arrays of the graph do not fit together or hold values that are not finite; the object is named.
+/// When arrays of the graph do not fit together or hold values that are not finite, and the object is named; or when it
+/// has several windows of time (see [`crate::window_alone`]).
 pub fn field_from_graph(graph: &SceneGraph, source: &str) -> Result<Field, SceneError> {
+    if !graph.windows.is_empty() {
+        let what =
+            format!("it has {} windows of time, each with its own splats; take one", graph.windows.len());
+        return Err(SceneError::Import { object: source.to_owned(), what });
+    }
     let times = TimeMap::of_file(&graph.time_codes)?;
     let reference = graph.time_codes.start();
     let has_instances = graph.nodes.iter().any(|node| matches!(node.kind, NodeKind::Instance { .. }));

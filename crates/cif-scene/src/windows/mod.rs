@@ -5,6 +5,7 @@
 //! that two windows share, carries its frame from one to the next, so that every object keeps one node with one path,
 //! whose splats change where the next window begins.
 
+mod alone;
 mod carry;
 mod reframe;
 mod span;
@@ -24,6 +25,8 @@ use crate::graph::{
 use crate::naming::{self, Names};
 use crate::{MotionModel, SceneError};
 use span::{Span, spans};
+
+pub use alone::window_alone;
 
 /// A place where two windows meet.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]

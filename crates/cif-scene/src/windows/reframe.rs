@@ -29,6 +29,13 @@ pub(super) fn reframed(node: &Node, object_from_local: &RigidTransform, span: &S
         raise_degree(&mut sample.values, node.splats.sh_degree, degree);
         harmonics.rotate_all(&mut sample.values, degree);
     }
+    // Where one time is read, the first: that of the window.
+    if let Some(first) = moved.appearance.opacities.first() {
+        moved.splats.opacities.clone_from(&first.values);
+    }
+    if let Some(first) = moved.appearance.colors.first() {
+        moved.splats.sh_coefficients.clone_from(&first.values);
+    }
     let codes = codes_of(node, span);
     let mut samples: Vec<DenseSample> = Vec::with_capacity(codes.len());
     let scales_change = matches!(&node.motion, Motion::Dense(dense) if dense.samples.iter().any(|sample| sample.scales.is_some()));

@@ -17,5 +17,6 @@ mod reading;
 mod splats;
 mod stage;
 mod values;
+mod windows;
 
 pub(crate) use stage::scene;

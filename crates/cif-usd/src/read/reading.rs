@@ -20,6 +20,8 @@ pub(super) struct Reading<'a, 'py> {
     pub(super) start: f64,
     /// First and last frame, for nodes that do not say theirs.
     pub(super) source_frames: (usize, usize),
+    /// True where values of splats are those of a window of time, and what stands at no time those of the first one.
+    pub(super) has_windows: bool,
     pub(super) warnings: RefCell<Vec<String>>,
 }
 

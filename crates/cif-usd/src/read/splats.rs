@@ -241,7 +241,7 @@ impl<'py> SplatPrim<'py> {
             }
         };
         // Beside samples stands the opacity for readers of one time, where somebody wrote it.
-        let resting = match self.opacity_times().map_err(python)?.is_empty() {
+        let resting = match reading.has_windows || self.opacity_times().map_err(python)?.is_empty() {
             true => None,
             false => self.opacities(reading, &reading.pxr.time_code(None).map_err(python)?, n)?,
         };

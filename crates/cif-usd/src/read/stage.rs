@@ -18,12 +18,12 @@ use super::owner::Owner;
 use super::reading::Reading;
 use super::splats::SplatPrim;
 use super::values::{self, plain, text};
-use super::{cameras, open};
+use super::{cameras, open, windows};
 use crate::pxr::{self, Pxr, reason};
 use crate::{ReadOptions, UsdError, tokens};
 
 /// Our entry in the `customLayerData` of a layer.
-#[derive(Default)]
+#[derive(Clone, Default)]
 struct Mark {
     ours: bool,
     /// Time codes per second of the layer that it stands on.
@@ -52,9 +52,6 @@ pub(crate) fn scene(path: &Path, options: ReadOptions) -> Result<SceneGraph, Usd
         if mark.ours && mark.layout != expected {
             let (path, generator, found) = (path.to_owned(), mark.generator, mark.layout);
             return Err(UsdError::Layout { path, generator, found, expected });
-        }
-        if mark.windows > 1 {
-            return Err(UsdError::Windows { path: path.to_owned(), windows: mark.windows });
         }
         if !mark.frame.is_valid() {
             let problem = format!("its layer places the scene nowhere ({:?})", mark.frame);
@@ -89,9 +86,13 @@ pub(crate) fn scene(path: &Path, options: ReadOptions) -> Result<SceneGraph, Usd
                 mark.codes.first().copied().unwrap_or(start).max(0.0) as usize,
                 last(&mark.codes, end),
             ),
+            has_windows: mark.windows > 1,
             warnings: RefCell::default(),
         };
-        read(&reading, &stage, mark)
+        match reading.has_windows {
+            false => read(&reading, &stage, mark),
+            true => windows::read(pxr, &stage, failed, || read(&reading, &stage, mark.clone())),
+        }
     })
 }
 

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use cif_scene::{CaptureFrame, LabelQuery, SceneGraph, UpAxis, joined};
+use cif_scene::{CaptureFrame, LabelQuery, Motion, SceneGraph, UpAxis, joined};
 use serde_json::json;
 
 use super::scenes::Maker;
@@ -119,8 +119,52 @@ fn splats_of_every_window_show_at_its_time_and_objects_keep_one_path() {
         let wanted = LabelQuery { pattern: graph.nodes[1].label.clone(), time_code: Some(12.0) };
         let found = query(&moved.join(name), &wanted, ReadOptions::default()).unwrap();
         assert!(found.iter().any(|found| found.instance == graph.nodes[1].name), "{found:?}");
-        let error = read_scene(&moved.join(name)).unwrap_err().to_string();
+        let read = read_scene(&moved.join(name)).unwrap();
+        assert_same(&read, &graph);
+        for (index, window) in graph.windows.iter().enumerate() {
+            let alone = cif_scene::window_alone(&read, index).unwrap();
+            let codes = alone.time_codes.samples.clone();
+            assert_eq!(codes[0], window.start);
+            let field = cif_scene::field_from_graph(&alone, name).unwrap();
+            assert_eq!(field.time_codes(), codes);
+            assert_eq!(field.len(), window.nodes.iter().map(|node| node.splats.len()).sum::<usize>());
+        }
+        let error = cif_scene::field_from_graph(&read, name).unwrap_err().to_string();
         assert!(error.contains("3 windows of time"), "{error}");
+    }
+}
+
+/// Paths as USD keeps them, and splats exactly.
+fn assert_same(read: &SceneGraph, written: &SceneGraph) {
+    assert_eq!(read.windows.len(), written.windows.len());
+    assert_eq!(read.nodes.len(), written.nodes.len());
+    for (read, written) in read.nodes.iter().zip(&written.nodes) {
+        assert_eq!((&read.name, &read.kind), (&written.name, &written.kind));
+        for code in 0..16 {
+            let code = f64::from(code);
+            let [a, b] = [read, written].map(|node| node.world_transform(code));
+            assert!(a.translation.distance(b.translation) < 1e-9, "{} {code}", read.name);
+            assert!((a.rotation - b.rotation).to_cols_array().iter().all(|value| value.abs() < 1e-6));
+            assert_eq!(read.is_visible(code), written.is_visible(code), "{} {code}", read.name);
+        }
+    }
+    for (read, written) in read.windows.iter().zip(&written.windows) {
+        assert_eq!(read.start, written.start);
+        for (read, written) in read.nodes.iter().zip(&written.nodes) {
+            assert_eq!(read.splats, written.splats, "{}", read.name);
+            assert_eq!(read.appearance, written.appearance, "{}", read.name);
+            let [a, b] = [read, written].map(|node| match &node.motion {
+                Motion::Dense(dense) => dense.samples.as_slice(),
+                _ => &[],
+            });
+            assert_eq!(a.len(), b.len(), "{}", read.name);
+            // Quaternions are made unit again.
+            for (a, b) in a.iter().zip(b) {
+                assert_eq!((a.time_code, &a.means, &a.scales), (b.time_code, &b.means, &b.scales));
+                let turns = a.orientations.as_flattened().iter().zip(b.orientations.as_flattened());
+                assert!(turns.into_iter().all(|(a, b)| (a - b).abs() < 1e-6), "{}", read.name);
+            }
+        }
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use cif_dataset::TimeWindow;
 use cif_field::{Field, Instance};
 use cif_scene::ReadOptions;
 use clap::Args;
@@ -33,7 +34,8 @@ Cameras stay as they were recorded; edits of them are named.
   cif import fox.ply -o fox.cif
   cif export table.cif table.usda              # then edit table.usda in any tool
   cif import table.usda --base table.cif -o edited.cif
-  cif diff table.cif edited.cif")]
+  cif diff table.cif edited.cif
+  cif import walk.usda --window 2/4 -o walk.2.cif   # of a stage of several windows of time, one")]
 pub(super) struct Import {
     /// File to read: .usda, .usdc, .usdz, .glb, .gltf or .ply
     #[arg(value_name = "FILE")]
@@ -50,6 +52,9 @@ pub(super) struct Import {
     /// Read layers that a stage brings in from outside its folder
     #[arg(long)]
     follow_external: bool,
+    /// Take one of several windows of time of a stage, as in --window 2/4
+    #[arg(long, value_name = "K/N", conflicts_with = "base")]
+    window: Option<TimeWindow>,
     #[command(flatten)]
     report: Report,
     /// Replace an existing scene
@@ -65,7 +70,8 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
     command.report.check(&mut outputs)?;
     // Before the file is read, which may take longer.
     let base = command.base.as_deref().map(scene::load).transpose()?;
-    let graph = formats::read(&command.file, ReadOptions { follow_external: command.follow_external })?;
+    let options = ReadOptions { follow_external: command.follow_external };
+    let graph = formats::read(&command.file, options, command.window)?;
     for warning in &graph.warnings {
         crate::messages::warning!("{warning}");
     }

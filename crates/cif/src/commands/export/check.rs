@@ -284,7 +284,7 @@ impl Checker<'_> {
         writing: &ExportOptions,
     ) -> Result<Finding, Error> {
         let start = Instant::now();
-        let read = formats::read(&target.path, ReadOptions::default())?;
+        let read = formats::read(&target.path, ReadOptions::default(), None)?;
         let mut copy = formats::field_of(&read, &target.path)?;
         let read_s = start.elapsed().as_secs_f64();
         // Of the capture rather than of the scene: no format holds exposures, and viewers choose a background.

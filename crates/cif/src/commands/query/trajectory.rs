@@ -48,7 +48,7 @@ fn graph(command: &Query) -> Result<SceneGraph, Error> {
             cif_scene::build(&scene::load(&command.path)?, &options).map_err(Error::plain)
         }
         Content::Graph(_) => {
-            formats::read(&command.path, ReadOptions { follow_external: command.follow_external })
+            formats::read_all(&command.path, ReadOptions { follow_external: command.follow_external })
         }
     }
 }

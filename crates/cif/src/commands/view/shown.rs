@@ -62,7 +62,10 @@ pub(super) fn open(path: &Path, capture: Option<&Path>, options: &CaptureOptions
             let options = SceneOptions { proxy_points: 0, hulls_per_instance: 0, ..SceneOptions::default() };
             (cif_scene::build(&field, &options).map_err(Error::plain)?, Some(field), BTreeMap::new())
         }
-        Content::Graph(format) => (formats::read(path, ReadOptions::default())?, None, paths(format, path)),
+        Content::Graph(format) => {
+            let graph = formats::read(path, ReadOptions::default(), options.frames.window)?;
+            (graph, None, paths(format, path))
+        }
     };
     for warning in &graph.warnings {
         warning!("{warning}");
@@ -72,7 +75,11 @@ pub(super) fn open(path: &Path, capture: Option<&Path>, options: &CaptureOptions
     let Some(capture) = capture else { return Ok(Shown { page, images: None }) };
     let dataset = of_scene(capture, options, &graph, field.as_ref())?;
     let codes = &graph.time_codes;
-    page.document.views = views(&dataset, |frame| code_at(&codes.times, &codes.samples, frame.time));
+    page.document.views = views(&dataset, |frame| match &dataset.window {
+        // A stage of several windows has fewer times of each than the window sees.
+        Some(window) => (window.first + frame.time_index) as f64,
+        None => code_at(&codes.times, &codes.samples, frame.time),
+    });
     Ok(Shown { page, images: Some(Images::of(dataset)) })
 }
 
