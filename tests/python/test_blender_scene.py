@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from small_stage import COUNT, FRAMES, positions, turned, write_stage
+from small_stage import COUNT, FRAMES, positions, turned, write_stage, write_windows
 
 bpy = pytest.importorskip("bpy", reason="Blender is not installed here: see tests/README.md")
 bpy.utils.expose_bundled_modules()
@@ -498,3 +498,15 @@ def test_cycles_shows_ellipsoids(path: Path, tmp_path: Path) -> None:
     assert 20 < red.sum() < 1500
     column = round(32 + 32 * 0.5 / 1.9 - 0.05 * 64)
     assert red[20:29, column - 3 : column + 4].any()
+
+
+def test_windows_show_one_after_the_other(tmp_path: Path) -> None:
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    objects = {obj.name: obj for obj in import_cif.import_stage(write_windows(tmp_path))}
+    pieces = [objects[f"mug_001.window_{number}"] for number in (1, 2)]
+    assert [len(piece.data.vertices) for piece in pieces] == [20, 12]
+    assert all(piece.parent == objects["mug_001"] for piece in pieces)
+    for frame in range(9):
+        bpy.context.scene.frame_set(frame)
+        shown = [not piece.hide_render for piece in pieces]
+        assert shown == [frame in (2, 3, 4), frame >= 5], frame

@@ -9,7 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_stage import COUNT, FRAMES, RED_BAND_0, orientations, positions, scales, turned, write_stage
+from small_stage import (
+    COUNT,
+    FRAMES,
+    RED_BAND_0,
+    orientations,
+    positions,
+    scales,
+    turned,
+    write_stage,
+    write_windows,
+)
 
 PLUGIN = Path(__file__).resolve().parents[2] / "plugin" / "blender"
 sys.path.insert(0, str(PLUGIN))
@@ -418,80 +428,6 @@ def test_far_scenes_are_worked_on_in_their_own_frame(path: Path, small: scene.Sc
         np.array([3e6, -2e5, 40]) + 100 * (mug.track.translations[0] + [0, 0, 0.25]),
         atol=1e-6,
     )
-
-
-ROWS = {
-    "point3f[] positions": "(0, 0, {height})",
-    "quatf[] orientations": "(1, 0, 0, 0)",
-    "float3[] scales": "(0.1, 0.1, 0.1)",
-    "float[] opacities": "0.5",
-    "color3f[] primvars:displayColor": "(1, 0, 0)",
-}
-"""Attributes of splats, and a value of each."""
-
-
-def write_windows(folder: Path) -> Path:
-    """A mug that shows from frame 2 on with 20 splats, and from frame 5 on with 12 others, which rise."""
-
-    def values(row: str, count: int, height: float = 0) -> str:
-        return "[" + ", ".join([row.format(height=height)] * count) + "]"
-
-    def clip(code: int, count: int, rises_until: int | None = None) -> str:
-        lines = []
-        for name, row in ROWS.items():
-            samples = [f"{code}: {values(row, count)}"]
-            if rises_until and "positions" in name:
-                samples.append(f"{rises_until}: {values(row, count, 0.3)}")
-            lines.append(f"{name}.timeSamples = {{ {', '.join(samples)} }}")
-        return over("\n".join(lines))
-
-    def over(text: str) -> str:
-        return f'over "World"\n{{\nover "mug_001"\n{{\nover "mug_001_splats"\n{{\n{text}\n}}\n}}\n}}\n'
-
-    full = "\n".join(f"{name} = {values(row, 20)}" for name, row in ROWS.items())
-    layers = {
-        "full": f'def "Full"\n{{\ndef {read.SPLAT_TYPE} "mug_001_splats"\n{{\n{full}\n}}\n}}\n',
-        "window-001": clip(0, 20),
-        "window-002": clip(5, 12, rises_until=8),
-        "manifest": over("\n".join(ROWS)),
-    }
-    for name, text in layers.items():
-        (folder / f"{name}.usda").write_text(f"#usda 1.0\n{text}")
-    path = folder / "walk.usda"
-    path.write_text("""#usda 1.0
-(
-    customLayerData = {
-        dictionary cif = {
-            int windows = 2
-        }
-    }
-    defaultPrim = "World"
-    startTimeCode = 0
-    endTimeCode = 8
-)
-def Xform "World" (
-    clips = {
-        dictionary default = {
-            double2[] active = [(0, 0), (5, 1)]
-            asset[] assetPaths = [@./window-001.usda@, @./window-002.usda@]
-            asset manifestAssetPath = @./manifest.usda@
-            string primPath = "/World"
-        }
-    }
-)
-{
-    def Xform "mug_001" (
-        payload = @./full.usda@</Full>
-    )
-    {
-        token[] semantics:labels:class = ["mug"]
-        token visibility.timeSamples = { 0: "invisible", 2: "inherited" }
-        double3 xformOp:translate.timeSamples = { 0: (0, 0, 0), 8: (4, 0, 0) }
-        uniform token[] xformOpOrder = ["xformOp:translate"]
-    }
-}
-""")
-    return path
 
 
 def test_windows_of_a_long_capture_are_pieces_that_show_one_after_the_other(tmp_path: Path) -> None:
