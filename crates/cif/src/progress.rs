@@ -153,12 +153,8 @@ impl Progress {
                 let (done, total) = (u64::from(*iteration), u64::from(*iterations));
                 self.show(Shown { prefix: stage.name(), done, total, message });
             }
-            TrainEvent::IdentityEstimated { frames, instances, unseen, empty_instances, .. } => {
+            TrainEvent::IdentityEstimated { frames, instances, unseen, .. } => {
                 self.line(&format!("identities of {instances} instances from {frames} frames; {unseen} Gaussians were never seen on a labelled pixel"));
-                if !empty_instances.is_empty() {
-                    let ids: Vec<String> = empty_instances.iter().map(u16::to_string).collect();
-                    self.line(&format!("warning: no Gaussian belongs to mask id {}", ids.join(", ")));
-                }
             }
             TrainEvent::Evaluated { stage, iteration, frames, psnr, iou, .. } => {
                 self.iou = iou.or(self.iou);

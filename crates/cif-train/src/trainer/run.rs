@@ -197,16 +197,41 @@ impl Trainer {
         let event = self.estimate_identities(true)?;
         drop(phase);
         requests.add(self.emit(observer, &event));
-        if let TrainEvent::IdentityEstimated { empty_instances, .. } = &event
-            && !empty_instances.is_empty()
-        {
-            let message = format!(
-                "no Gaussian is most probably of instance {empty_instances:?}: too small, or hidden in the frames with \
-                 masks"
-            );
-            requests.add(self.emit(observer, &TrainEvent::Warning { message }));
+        if let TrainEvent::IdentityEstimated { empty_instances, .. } = &event {
+            for said in self.on_empty_instances(empty_instances) {
+                requests.add(self.emit(observer, &said));
+            }
         }
         Ok(())
+    }
+
+    /// A word on instances without Gaussians: those that no training mask shows, which other windows of time may, and
+    /// others.
+    fn on_empty_instances(&self, ids: &[u16]) -> Vec<TrainEvent> {
+        let (field, pixels) = (&self.state.field, &self.state.label_pixels);
+        let indices = ids.iter().filter_map(|id| field.instance_by_id(*id));
+        let (masked, absent): (Vec<usize>, Vec<usize>) =
+            indices.partition(|index| pixels.get(*index).is_some_and(|pixels| *pixels > 0.0));
+        let named = |indices: &[usize]| {
+            let names = indices.iter().map(|index| field.instances[*index].label.as_str());
+            names.collect::<Vec<_>>().join(", ")
+        };
+        let mut said = Vec::new();
+        if !masked.is_empty() {
+            let message = format!(
+                "no Gaussian is most probably of {}: too small, or hidden in the frames with masks",
+                named(&masked)
+            );
+            said.push(TrainEvent::warning(message));
+        }
+        if !absent.is_empty() {
+            let message = format!("no training mask shows {}", named(&absent));
+            said.push(match self.state.capture().window {
+                Some(_) => TrainEvent::note(format!("{message} in this window")),
+                None => TrainEvent::warning(message),
+            });
+        }
+        said
     }
 
     /// Trains a stage that has steps.
@@ -492,5 +517,39 @@ impl Trainer {
             self.state.field.tracks.iter_mut().for_each(Tracks::forget_instances);
         }
         self.engine.changed(Changed::Everything);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use cif_dataset::{CaptureWindow, TimeWindow};
+
+    use super::super::guard_tests::support::{Scene, capture, small_config};
+    use super::*;
+
+    #[test]
+    fn instances_that_other_windows_show_are_no_warning() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut trainer = Trainer::new(capture(folder.path(), Scene::default()), small_config()).unwrap();
+        trainer.state.label_pixels = vec![5.0, 0.0, 0.0];
+        let said = |trainer: &Trainer| -> Vec<String> {
+            let events = trainer.on_empty_instances(&[4, 7, 9]).into_iter();
+            events
+                .map(|event| match event {
+                    TrainEvent::Warning { message } => format!("warning: {message}"),
+                    TrainEvent::Note { message } => format!("note: {message}"),
+                    other => panic!("{other:?}"),
+                })
+                .collect()
+        };
+        let absent = "no training mask shows ball 7, ball 9";
+        let masked = "warning: no Gaussian is most probably of ball 4";
+        let all = said(&trainer);
+        assert!(all.len() == 2 && all[0].starts_with(masked), "{all:?}");
+        assert_eq!(all[1], format!("warning: {absent}"));
+        let window = TimeWindow::new(1, 2).unwrap();
+        trainer.state.dataset.window = Some(CaptureWindow { window, first: 0, times: [0.0, 0.5] });
+        assert_eq!(said(&trainer)[1], format!("note: {absent} in this window"));
+        assert!(trainer.on_empty_instances(&[]).is_empty());
     }
 }
