@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cif
 import pytest
 from pxr import Usd, UsdGeom
 
@@ -72,6 +73,18 @@ def test_the_stage_has_one_path_of_each_object_and_splats_of_each_window(batch: 
     assert changed
     cameras = [prim for prim in stage.Traverse() if prim.GetTypeName() == "Camera"]
     assert cameras
+
+
+def test_python_takes_windows_too(batch: Path) -> None:
+    part = cif.open_dataset(EXAMPLE, window="2/2")
+    assert len(part.times) == 41
+    with pytest.raises(ValueError, match="2/4 is the second of four"):
+        cif.open_dataset(EXAMPLE, window="3/2")
+    field, changes = cif.import_scene(batch / "run" / "walk.usda", window="1/2")
+    assert changes is None and len(field.times) == 36
+    scores = cif.evaluate(batch / "run.window002" / "scene.cif", EXAMPLE)
+    of_command = json.loads((batch / "run.window002" / "scores.json").read_text())
+    assert scores["frames"] == of_command["frames"]
 
 
 def test_objects_are_found_and_what_one_scene_cannot_hold_is_refused(batch: Path, tmp_path: Path) -> None:

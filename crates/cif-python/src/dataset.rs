@@ -2,8 +2,9 @@
 
 use std::path::PathBuf;
 
+use cif_dataset::TimeWindow;
 use numpy::PyArray2;
-use pyo3::exceptions::PyIndexError;
+use pyo3::exceptions::{PyIndexError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 
@@ -23,18 +24,27 @@ pub(crate) struct Dataset {
 /// Open a capture.
 ///
 /// masks names a folder inside it or anywhere, by default "masks" where it has one; downscale reduces images
-/// by 1, 2, 4 and so on, by default to the largest stored.
+/// by 1, 2, 4 and so on, by default to the largest stored. window takes one of several windows of time of a long
+/// capture, "2/4" the second of four.
 #[pyfunction]
-#[pyo3(signature = (path, masks=None, downscale=None))]
+#[pyo3(signature = (path, masks=None, downscale=None, window=None))]
 pub(crate) fn open_dataset(
     py: Python<'_>,
     path: PathBuf,
     masks: Option<PathBuf>,
     downscale: Option<u32>,
+    window: Option<&str>,
 ) -> PyResult<Dataset> {
-    let options = cif_dataset::OpenOptions { masks, downscale, ..cif_dataset::OpenOptions::default() };
+    let window = window_of(window)?;
+    let options =
+        cif_dataset::OpenOptions { masks, downscale, window, ..cif_dataset::OpenOptions::default() };
     let inner = process::detach(py, || cif_dataset::Dataset::open(&path, &options))?.map_err(cif_error)?;
     Ok(Dataset { inner, downscale })
+}
+
+/// A window of time by its text.
+pub(crate) fn window_of(text: Option<&str>) -> PyResult<Option<TimeWindow>> {
+    text.map(|text| text.parse().map_err(PyValueError::new_err)).transpose()
 }
 
 impl Dataset {

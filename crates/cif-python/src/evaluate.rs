@@ -118,7 +118,8 @@ pub(crate) fn evaluate<'py>(
         Capture::Opened(dataset) => Source::Opened(&dataset.inner),
         Capture::Folder(folder) => {
             let downscale = downscale.or_else(|| training_config(field)?.downscale);
-            Source::Folder(folder.clone(), OpenOptions { masks, downscale, ..OpenOptions::default() })
+            let window = field.record.window;
+            Source::Folder(folder.clone(), OpenOptions { masks, downscale, window, ..OpenOptions::default() })
         }
     };
     let stopped = Arc::new(AtomicBool::new(false));

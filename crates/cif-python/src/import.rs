@@ -6,6 +6,7 @@ use cif::formats;
 use cif_scene::ReadOptions;
 use pyo3::prelude::*;
 
+use crate::dataset::window_of;
 use crate::error::cif_error;
 use crate::field::Field;
 use crate::{arrays, process};
@@ -18,18 +19,21 @@ fn name_of(path: &Path) -> String {
 ///
 /// With base, the field that the file was exported from, what was changed in the file is applied to it, and
 /// the second value lists the edits as diff does; otherwise it is None. force_base takes a base that the file
-/// was not exported from.
+/// was not exported from. window takes one of several windows of time of a stage, as "2/4".
 #[pyfunction]
-#[pyo3(signature = (path, *, base=None, force_base=false))]
+#[pyo3(signature = (path, *, base=None, force_base=false, window=None))]
 pub(crate) fn import_scene<'py>(
     py: Python<'py>,
     path: PathBuf,
     base: Option<PyRef<'py, Field>>,
     force_base: bool,
+    window: Option<&str>,
 ) -> PyResult<(Field, Bound<'py, PyAny>)> {
+    let window = window_of(window)?;
     let base = base.as_deref();
     let (inner, changes) = process::detach(py, || {
-        let graph = formats::read(&path, ReadOptions::default(), None).map_err(|error| error.to_string())?;
+        let graph =
+            formats::read(&path, ReadOptions::default(), window).map_err(|error| error.to_string())?;
         let source = name_of(&path);
         match base {
             Some(base) => cif_scene::import_edits(&base.inner, &graph, &source, force_base)

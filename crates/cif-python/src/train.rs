@@ -150,7 +150,8 @@ impl Run {
                         self.typed.alone(layout)?.downscale
                     }
                 };
-                let options = OpenOptions { downscale, ..OpenOptions::default() };
+                let window = state.as_ref().and_then(|state| state.field.record.window);
+                let options = OpenOptions { downscale, window, ..OpenOptions::default() };
                 let _phase = phases.enter(Phase::Open, 0);
                 (cif_dataset::Dataset::open(&folder, &options).map_err(Error::plain)?, downscale)
             }

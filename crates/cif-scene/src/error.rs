@@ -69,7 +69,7 @@ pub enum SceneError {
     /// Scenes that are no windows of one capture.
     #[error("the scenes are no windows of one capture: {what}")]
     Windows {
-        /// What does not fit, and what to do.
+        /// The misfit and its remedy.
         what: String,
     },
     /// An option outside its range.

@@ -393,11 +393,13 @@ def open_dataset(
     path: str | os.PathLike[str],
     masks: str | os.PathLike[str] | None = None,
     downscale: int | None = None,
+    window: str | None = None,
 ) -> Dataset:
     """Open a capture.
 
     masks names a folder inside it or anywhere, by default "masks" where it has one; downscale reduces images
-    by 1, 2, 4 and so on, by default to the largest stored.
+    by 1, 2, 4 and so on, by default to the largest stored. window takes one of several windows of time of a long
+    capture, "2/4" the second of four.
     """
 
 class LabelPattern:
@@ -421,13 +423,17 @@ def query_stage(
     """
 
 def import_scene(
-    path: str | os.PathLike[str], *, base: Field | None = None, force_base: bool = False
+    path: str | os.PathLike[str],
+    *,
+    base: Field | None = None,
+    force_base: bool = False,
+    window: str | None = None,
 ) -> tuple[Field, dict[str, Any] | None]:
     """Read a USD, glTF or PLY file as a field.
 
     With base, the field that the file was exported from, what was changed in the file is applied to it, and
     the second value lists the edits as diff does; otherwise it is None. force_base takes a base that the file
-    was not exported from.
+    was not exported from. window takes one of several windows of time of a stage, as "2/4".
     """
 
 def diff(before: str | os.PathLike[str], after: str | os.PathLike[str]) -> dict[str, Any]:

@@ -24,8 +24,8 @@ pub struct SceneGraph {
     pub time_codes: TimeCodes,
     /// One node per instance in the order of the field's instance table, then the background where there is one.
     pub nodes: Vec<Node>,
-    /// What the nodes show window by window, where the scene was trained so (see [`crate::windows`]): at least two, the first
-    /// of which the nodes hold as well. Empty for all others.
+    /// Splats of the nodes window by window, where the scene was trained so (see [`crate::windows`]): at least two windows,
+    /// the first of which the nodes hold as well. Empty for all others.
     pub windows: Vec<SceneWindow>,
     /// Recorded cameras.
     pub cameras: Vec<CameraTrack>,

@@ -2,7 +2,7 @@
 
 use super::node::Node;
 
-/// What a scene shows during one window of time, where a long capture was trained window by window.
+/// Splats of a scene during one window of time, where a long capture was trained window by window.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneWindow {
     /// Its first time code; it lasts until the next window begins.

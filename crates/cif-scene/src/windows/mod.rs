@@ -124,12 +124,12 @@ pub fn joined(mut graphs: Vec<SceneGraph>) -> Result<(SceneGraph, Vec<Seam>), Sc
     Ok((SceneGraph { nodes, windows, cameras, time_codes, omitted, warnings, origin, ..first }, seams))
 }
 
-/// What is the same in all windows.
+/// Identity of a node over all windows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Key {
     /// An instance, by its mask value.
     Instance(u16),
-    /// What belongs to none, or what moves of it.
+    /// The part of the scene that belongs to no instance, or the moving part of that.
     Background { moves: bool },
 }
 

@@ -24,7 +24,7 @@ fn windows(seed: u64) -> SceneGraph {
     joined((0..3).map(window).collect()).unwrap().0
 }
 
-/// What every prim of splats holds at every time code, by the graph.
+/// Values of every prim of splats at every time code, by the graph.
 fn expected(graph: &SceneGraph) -> serde_json::Value {
     let mut all = Vec::new();
     for code in &graph.time_codes.samples {
