@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -90,6 +91,10 @@ def test_python_takes_windows_too(batch: Path) -> None:
 def test_objects_are_found_and_what_one_scene_cannot_hold_is_refused(batch: Path, tmp_path: Path) -> None:
     stage = batch / "run" / "walk.usda"
     first, second = (batch / f"run.window00{k}" / "scene.cif" for k in (1, 2))
+    other = tmp_path / "other.cif"
+    capture = tmp_path / "elsewhere"
+    shutil.copytree(EXAMPLE, capture)
+    run("train", capture, "-o", other, "--window", "2/2", *SETTINGS.split())
     assert "red mug" in run("query", stage, "--label", "*")
     assert "--window 1/2" in run("import", stage, "-o", tmp_path / "a.cif", code=1)
     paths = run("query", stage, "--label", "red mug", "--trajectory", "-").splitlines()
@@ -102,10 +107,12 @@ def test_objects_are_found_and_what_one_scene_cannot_hold_is_refused(batch: Path
         "give each once": [first, first, "a.usda"],
         "does not hold several windows": [first, second, "a.glb"],
         "no file to write": [first, second, "--report"],
+        "a stage with a file for each": [first, second, "a.usdz"],
+        "was trained on the capture": [first, other, "a.usda"],
         "--check is about one scene": [first, second, "a.usda", "--check"],
     }
     for said, words in cases.items():
-        paths = [tmp_path / word if word in ("a.usda", "a.glb") else word for word in words]
+        paths = [tmp_path / word if word in ("a.usda", "a.usdz", "a.glb") else word for word in words]
         done = subprocess.run([CIF, "export", *map(str, paths)], capture_output=True, text=True)
         assert done.returncode != 0 and said in done.stderr, (said, done.stderr)
-    assert not list(tmp_path.iterdir())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["elsewhere", "other.cif", "other.train.toml"]

@@ -132,7 +132,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     command.targets.check(&command.writing, &preferred, command.force, &mut outputs)?;
     let bakes_blur = command.bake_blur.or(preferred.bake_blur).unwrap_or_default();
     command.check.refuse(&command.targets, &command.writing, &preferred, bakes_blur)?;
-    windows::refuse(&command.targets, command.frames.is_some(), command.check.is_asked())?;
+    windows::refuse(&command.targets, &command.writing, command.frames.is_some(), command.check.is_asked())?;
     command.targets.windows.iter().try_for_each(|window| outputs.reads(window))?;
     if let Some(preset) = command.preset {
         note!("--for {} is {}; flags on the command line override it", preset.name(), preset.flags());
@@ -150,7 +150,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     };
     let graph = cif_scene::build(&field, &options_of(&field)).map_err(Error::plain)?;
     let options = options_of(&field);
-    let (graph, seams) = windows::with_further(graph, &command.targets.windows, options_of)?;
+    let (graph, seams) = windows::with_further((&field, graph), &command.targets.windows, options_of)?;
     for warning in &graph.warnings {
         crate::messages::warning!("{warning}");
     }

@@ -145,6 +145,11 @@ fn density(text: &str) -> Result<f64, String> {
 }
 
 impl Writing {
+    /// True with --single-file.
+    pub(super) fn is_single_file(&self) -> bool {
+        self.single_file
+    }
+
     /// Options, with the moment of formats that hold one.
     ///
     /// # Errors

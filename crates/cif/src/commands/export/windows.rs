@@ -5,12 +5,18 @@ use std::path::PathBuf;
 use cif_field::Field;
 use cif_scene::{SceneGraph, SceneOptions, Seam};
 
-use super::targets::Targets;
+use super::targets::{Targets, Writing};
 use crate::commands::shared::{scene, table};
+use crate::endings;
 use crate::error::Error;
 
 /// Refuses what cannot be done with several scenes, before any is read.
-pub(super) fn refuse(targets: &Targets, has_frames: bool, is_checked: bool) -> Result<(), Error> {
+pub(super) fn refuse(
+    targets: &Targets,
+    writing: &Writing,
+    has_frames: bool,
+    is_checked: bool,
+) -> Result<(), Error> {
     if targets.windows.is_empty() {
         return Ok(());
     }
@@ -26,6 +32,13 @@ pub(super) fn refuse(targets: &Targets, has_frames: bool, is_checked: bool) -> R
             "write .usda or .usdc, or export each window by itself",
         ));
     }
+    let packed = targets.iter().find(|target| endings::ending(&target.path) == "usdz");
+    if writing.is_single_file() || packed.is_some() {
+        return Err(Error::usage(
+            "several windows of time are a stage with a file for each",
+            "write .usda or .usdc, without --single-file",
+        ));
+    }
     for (flag, is_given) in [("--frames", has_frames), ("--check", is_checked)] {
         if is_given {
             return Err(Error::usage(
@@ -37,9 +50,9 @@ pub(super) fn refuse(targets: &Targets, has_frames: bool, is_checked: bool) -> R
     Ok(())
 }
 
-/// Joins a graph and those of further windows; the graph as it is where there are none.
+/// Joins the graph of a field and those of further windows; the graph as it is where there are none.
 pub(super) fn with_further(
-    graph: SceneGraph,
+    (first, graph): (&Field, SceneGraph),
     further: &[PathBuf],
     options: impl Fn(&Field) -> SceneOptions,
 ) -> Result<(SceneGraph, Vec<Seam>), Error> {
@@ -50,6 +63,18 @@ pub(super) fn with_further(
     for path in further {
         // One field at a time: graphs are smaller.
         let field = scene::load(path)?;
+        let captures = [first, &field].map(|field| field.record.capture.as_deref());
+        if let [Some(one), Some(other)] = captures
+            && one != other
+        {
+            return Err(Error::failed(
+                format!(
+                    "{} was trained on the capture `{other}`, and the first scene on `{one}`",
+                    path.display()
+                ),
+                "give the windows of one capture",
+            ));
+        }
         let graph = cif_scene::build(&field, &options(&field));
         graphs.push(graph.map_err(|error| Error::plain(format!("{}: {error}", path.display())))?);
     }
