@@ -116,3 +116,21 @@ def test_objects_are_found_and_what_one_scene_cannot_hold_is_refused(batch: Path
         done = subprocess.run([CIF, "export", *map(str, paths)], capture_output=True, text=True)
         assert done.returncode != 0 and said in done.stderr, (said, done.stderr)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["elsewhere", "other.cif", "other.train.toml"]
+
+
+def test_make_goes_from_a_capture_to_one_stage_and_repeats_nothing(tmp_path: Path) -> None:
+    config = tmp_path / "small.toml"
+    config.write_text(
+        "[stages]\ncoarse = 5\nfine = 20\ninstance = 5\n[densify]\nmax_gaussians = 800\n"
+        "[model]\nspatial_resolution = [8, 8, 8]\n[motion]\nrehearsal = 5\nrigid = false\nparts = false\n"
+    )
+    made = tmp_path / "made"
+    words = ("make", EXAMPLE, "-o", made, "--windows", "2", "--config", config)
+    run(*words)
+    results = ["scene.window001.cif", "scene.window002.cif", "scene.usda"]
+    times = [(made / name).stat().st_mtime_ns for name in results]
+    stage = Usd.Stage.Open(str(made / "scene.usda"))
+    world = Usd.ClipsAPI(stage.GetPrimAtPath("/World"))
+    assert [start for start, _ in world.GetClipActive()] == [0, 36]
+    run(*words)
+    assert [(made / name).stat().st_mtime_ns for name in results] == times
