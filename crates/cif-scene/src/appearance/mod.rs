@@ -204,8 +204,8 @@ impl Appearance {
     }
 }
 
-/// Values at a time code: linear between samples, held outside.
-fn at(samples: &[AppearanceSample], time_code: f64) -> Option<Vec<f32>> {
+/// Values at a time code: linear between samples, held outside; `None` without samples.
+pub(crate) fn at(samples: &[AppearanceSample], time_code: f64) -> Option<Vec<f32>> {
     let (first, last) = samples.first().zip(samples.last())?;
     let after = samples.partition_point(|sample| sample.time_code <= time_code);
     if after == 0 || after == samples.len() {

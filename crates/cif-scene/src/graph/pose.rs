@@ -22,6 +22,16 @@ impl PoseSample {
         Self { time_code, translation: transform.translation, rotation }
     }
 
+    /// The pose between this and another one, by the share of the other: linear in translation, spherical in rotation.
+    #[must_use]
+    pub(crate) fn towards(&self, other: &Self, share: f64, time_code: f64) -> Self {
+        Self {
+            time_code,
+            translation: self.translation.lerp(other.translation, share),
+            rotation: self.rotation.slerp(other.rotation, share),
+        }
+    }
+
     /// The pose as `world_from_local`.
     #[must_use]
     pub fn transform(&self) -> RigidTransform {
@@ -44,10 +54,5 @@ pub fn pose_at(track: &[PoseSample], rest: DVec3, time_code: f64) -> PoseSample 
         return PoseSample { time_code, ..*last };
     }
     let (a, b) = (&track[after - 1], &track[after]);
-    let fraction = (time_code - a.time_code) / (b.time_code - a.time_code);
-    PoseSample {
-        time_code,
-        translation: a.translation.lerp(b.translation, fraction),
-        rotation: a.rotation.slerp(b.rotation, fraction),
-    }
+    a.towards(b, (time_code - a.time_code) / (b.time_code - a.time_code), time_code)
 }

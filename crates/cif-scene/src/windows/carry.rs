@@ -110,11 +110,8 @@ fn track(poses: &[Option<Poses<'_>>], spans: &[Span]) -> Vec<PoseSample> {
         let Some(now) = now else { continue };
         let before = index.checked_sub(1).and_then(|before| poses[before].as_ref());
         let after = poses.get(index + 1).and_then(Option::as_ref);
-        let keys = now.node.track().iter().map(|key| key.time_code).filter(|code| span.lasts_at(*code));
-        let mut codes: Vec<f64> = keys.chain(span.shared()).chain(span.ends()).collect();
-        codes.sort_by(f64::total_cmp);
-        codes.dedup();
-        for code in codes {
+        let keys = now.node.track().iter().map(|key| key.time_code);
+        for code in span.codes(keys.chain(span.shared())) {
             let own = now.world_from_object(code);
             let other = match span.share_of_neighbour(code) {
                 Some((false, share)) => before.map(|before| (before, share)),
@@ -124,7 +121,7 @@ fn track(poses: &[Option<Poses<'_>>], spans: &[Span]) -> Vec<PoseSample> {
             let own = PoseSample::new(code, &own);
             track.push(match other {
                 Some((other, share)) => {
-                    mixed(&own, &PoseSample::new(code, &other.world_from_object(code)), share)
+                    own.towards(&PoseSample::new(code, &other.world_from_object(code)), share, code)
                 }
                 None => own,
             });
@@ -132,14 +129,6 @@ fn track(poses: &[Option<Poses<'_>>], spans: &[Span]) -> Vec<PoseSample> {
     }
     keys::one_hemisphere(&mut track);
     without_repetitions(track)
-}
-
-fn mixed(a: &PoseSample, b: &PoseSample, share: f64) -> PoseSample {
-    PoseSample {
-        time_code: a.time_code,
-        translation: a.translation.lerp(b.translation, share),
-        rotation: a.rotation.slerp(b.rotation, share),
-    }
 }
 
 /// A track without samples between equal ones; none where all are equal and unturned.

@@ -3,6 +3,7 @@
 use cif_geometry::spherical_harmonics::HarmonicsRotation;
 use cif_geometry::{Bounds, RigidTransform};
 
+use crate::appearance;
 use crate::graph::{
     Appearance, AppearanceSample, ConvexHull, DenseMotion, DenseSample, Motion, Node, raise_degree,
 };
@@ -73,11 +74,7 @@ fn codes_of(node: &Node, span: &Span) -> Vec<f64> {
         Motion::Parts(_) => span.seen.clone(),
         Motion::Dense(dense) => dense.samples.iter().map(|sample| sample.time_code).collect(),
     };
-    let mut codes: Vec<f64> =
-        keys.into_iter().filter(|code| span.lasts_at(*code)).chain(span.ends()).collect();
-    codes.sort_by(f64::total_cmp);
-    codes.dedup();
-    codes
+    span.codes(keys)
 }
 
 fn sample_of(
@@ -106,23 +103,9 @@ fn during(samples: &[AppearanceSample], span: &Span) -> Vec<AppearanceSample> {
     if samples.is_empty() {
         return Vec::new();
     }
-    let inside = samples.iter().map(|sample| sample.time_code).filter(|code| span.lasts_at(*code));
-    let mut codes: Vec<f64> = inside.chain(span.ends()).collect();
-    codes.sort_by(f64::total_cmp);
-    codes.dedup();
-    codes.into_iter().map(|code| at(samples, code)).collect()
-}
-
-fn at(samples: &[AppearanceSample], code: f64) -> AppearanceSample {
-    let after = samples.partition_point(|sample| sample.time_code <= code);
-    let (a, b) = (&samples[after.max(1) - 1], &samples[after.min(samples.len() - 1)]);
-    let share = if b.time_code > a.time_code {
-        ((code - a.time_code) / (b.time_code - a.time_code)).clamp(0.0, 1.0) as f32
-    } else {
-        0.0
-    };
-    let values = a.values.iter().zip(&b.values).map(|(a, b)| a + share * (b - a)).collect();
-    AppearanceSample { time_code: code, values }
+    let codes = span.codes(samples.iter().map(|sample| sample.time_code));
+    let at = |time_code| Some(AppearanceSample { time_code, values: appearance::at(samples, time_code)? });
+    codes.into_iter().filter_map(at).collect()
 }
 
 /// A hull in the frame of the object, that of a part as the part lies at the start.

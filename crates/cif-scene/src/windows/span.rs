@@ -21,8 +21,13 @@ impl Span {
         (self.start..=self.end).contains(&code)
     }
 
-    pub(super) fn ends(&self) -> [f64; 2] {
-        [self.start, self.end]
+    /// Those of some time codes while it lasts, and its ends, ascending.
+    pub(super) fn codes(&self, codes: impl IntoIterator<Item = f64>) -> Vec<f64> {
+        let inside = codes.into_iter().filter(|code| self.lasts_at(*code));
+        let mut codes: Vec<f64> = inside.chain([self.start, self.end]).collect();
+        codes.sort_by(f64::total_cmp);
+        codes.dedup();
+        codes
     }
 
     /// Times that it shares with the window before it.

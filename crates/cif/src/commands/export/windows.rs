@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use cif_field::Field;
 use cif_scene::{SceneGraph, SceneOptions, Seam};
 
-use super::targets::{Targets, Writing};
+use super::targets::{Target, Targets, Writing};
 use crate::commands::shared::{scene, table};
 use crate::endings;
 use crate::error::Error;
@@ -32,10 +32,10 @@ pub(super) fn refuse(
             "write .usda or .usdc, or export each window by itself",
         ));
     }
-    let packed = targets.iter().find(|target| endings::ending(&target.path) == "usdz");
-    if writing.is_single_file() || packed.is_some() {
+    let is_packed = |target: &&Target| writing.is_single_file() || endings::ending(&target.path) == "usdz";
+    if let Some(target) = targets.iter().find(is_packed) {
         return Err(Error::usage(
-            "several windows of time are a stage with a file for each",
+            format!("{target:?}: several windows of time are a stage with a file for each"),
             "write .usda or .usdc, without --single-file",
         ));
     }
