@@ -9,9 +9,9 @@
 //! | `workplace` | folders for temporary files, which do not either |
 //!
 //! Outputs are written to a temporary file in their own folder, which takes their name once it is on the disk.
-//! Temporary files begin with `.cif-tmp-`, have a random name and are locked by the process that writes them. They
-//! are removed when writing fails and by [`abandon`]; those of a process that was killed are not locked any more, and
-//! go when the next output is written into their folder.
+//! Temporary files begin with `.cif-tmp-`, have a random name that ends in the machine's, and are locked by the process that
+//! writes them. They are removed when writing fails and by [`abandon`]; those of a process that was killed are not locked any
+//! more, and go when the next output is written into their folder, from another machine a day later.
 
 mod name;
 mod place;

@@ -5,12 +5,26 @@ use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use crate::place::{Place, folder_of, place, target};
 
-/// Beginning of the names of temporary files; a random part without a dot follows. Files that belong to one of them
-/// have its name, a dot and any suffix.
+/// Beginning of the names of temporary files; a random part, `@` and the name of this machine follow, without dots. Files that
+/// belong to one of them have its name, a dot and any suffix.
 const PREFIX: &str = ".cif-tmp-";
+
+/// Age at which a file that another machine has left is removed: its locks may not be seen here, and clocks differ. Nobody
+/// takes that long to write a file; chosen.
+const LEFT_ELSEWHERE: Duration = Duration::from_secs(24 * 3600);
+
+/// End of the names of temporary files of this machine.
+fn of_this_machine() -> String {
+    #[cfg(unix)]
+    let name = rustix::system::uname().nodename().to_string_lossy().into_owned();
+    #[cfg(not(unix))]
+    let name = std::env::var("COMPUTERNAME").unwrap_or_default();
+    format!("@{}", name.replace(|letter: char| !letter.is_ascii_alphanumeric(), "-"))
+}
 
 /// Temporary files of this process, and the folders that were rid of those of dead ones. Whoever creates, renames or
 /// removes one holds the lock, so that [`abandon`] meets none in between.
@@ -120,7 +134,8 @@ impl Unfinished {
             sweep(folder);
         }
         let mut builder = tempfile::Builder::new();
-        builder.prefix(PREFIX).rand_bytes(12);
+        let machine = of_this_machine();
+        builder.prefix(PREFIX).suffix(&machine).rand_bytes(12);
         // Temporary files are private by default; the result should have the usual permissions. Errors are those of the
         // system, for the temporary name says nothing to anybody.
         let create = |path: &Path| OpenOptions::new().read(true).write(true).create_new(true).open(path);
@@ -148,11 +163,18 @@ impl Drop for Unfinished {
 
 /// Removes what dead processes left in a folder.
 fn sweep(folder: &Path) {
+    let machine = of_this_machine();
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
         let name = entry.file_name();
         let random = name.to_str().and_then(|name| name.strip_prefix(PREFIX));
         let is_ours = random.is_some_and(|random| !random.contains('.'));
         if !is_ours || !entry.file_type().is_ok_and(|kind| kind.is_file()) {
+            continue;
+        }
+        let is_from_elsewhere =
+            random.is_some_and(|random| random.contains('@') && !random.ends_with(&machine));
+        let age = || entry.metadata().ok()?.modified().ok()?.elapsed().ok();
+        if is_from_elsewhere && age().is_none_or(|age| age < LEFT_ELSEWHERE) {
             continue;
         }
         let Ok(file) = OpenOptions::new().read(true).write(true).open(entry.path()) else { continue };
@@ -420,6 +442,22 @@ mod tests {
         alive.lock().unwrap();
         write(&at("new"), b"x").unwrap();
         assert_eq!(names(folder.path()), [".cif-mine", ".cif-tmp-alive", ".cif-tmp-alive.usda", "new"]);
+    }
+
+    #[test]
+    fn what_another_machine_writes_stays_for_a_day() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let here = format!(".cif-tmp-here{}", of_this_machine());
+        for name in
+            [&here, ".cif-tmp-young@elsewhere", ".cif-tmp-old@elsewhere", ".cif-tmp-old@elsewhere.usda"]
+        {
+            fs::write(at(name), "x").unwrap();
+        }
+        let old = std::time::SystemTime::now() - 2 * LEFT_ELSEWHERE;
+        File::options().write(true).open(at(".cif-tmp-old@elsewhere")).unwrap().set_modified(old).unwrap();
+        write(&at("new"), b"x").unwrap();
+        assert_eq!(names(folder.path()), [".cif-tmp-young@elsewhere", "new"]);
     }
 
     #[cfg(unix)]

@@ -46,7 +46,7 @@ pub struct Destination {
     known: Option<Contents>,
     /// Settings that are in their file.
     written: Option<String>,
-    _lock: Option<Lock>,
+    _lock: Lock,
 }
 
 impl Destination {

@@ -719,3 +719,73 @@ fn heads_and_taxonomies_survive_and_raise_the_format() {
     std::fs::write(file.path(), &bytes).unwrap();
     assert_eq!(Field::load(file.path()).unwrap(), finished.field, "the scene is read without it");
 }
+
+/// One scene for each version of the layout, which holds what that version added.
+fn of_every_format() -> Vec<Checkpoint> {
+    let plain = Checkpoint { field: testing::field(6, 2), training: None, head: None };
+    let mut still = plain.clone();
+    still.field.deformation.as_mut().unwrap().still = (0..6).map(|row| row % 2 == 1).collect();
+    let recorded = Checkpoint { field: testing::tracked_field(6, 4), training: None, head: None };
+    let changed = |change: &dyn Fn(&mut crate::Tracks)| {
+        let mut scene = recorded.clone();
+        change(scene.field.tracks.as_mut().unwrap());
+        scene
+    };
+    let moving = changed(&|tracks| {
+        for group in &mut tracks.groups {
+            (group.opacities, group.colors) = (None, None);
+        }
+    });
+    let evident = changed(&|tracks| tracks.groups[0].rotation = Some(RotationEvidence::Observed));
+    let joint = Joint { base: 0, kind: JointKind::Prismatic, axis: DVec3::Y };
+    let jointed = changed(&|tracks| tracks.groups[2].joint = Some(joint));
+    let head = TrainingState {
+        json: json!({ "name": "sa4d" }),
+        tensors: BTreeMap::from([("weights".to_owned(), StateTensor::F32(vec![0.25, -1.5]))]),
+    };
+    let headed = Checkpoint { head: Some(head), ..jointed.clone() };
+    let mut named = headed.clone();
+    named.field.instances[1].taxonomies = [("coco".to_owned(), "cup".to_owned())].into();
+    let mut owned = named.clone();
+    let id = owned.field.instances[1].id;
+    for group in [0, 2] {
+        owned.field.tracks.as_mut().unwrap().groups[group].instance = Some(id);
+    }
+    vec![plain, moving, still, recorded, evident, jointed, headed, named, owned]
+}
+
+/// Scenes as each version of the layout was written, which every later cif reads: `formats/N.cif`. One of a new version is
+/// added by `CIF_WRITE_FORMATS=1 cargo test -p cif-field formats`; those that are there stay.
+#[test]
+fn scenes_of_all_formats_are_read() {
+    let folder = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/src/checkpoint/formats"));
+    let contents = folder.join("contents.json");
+    let text = fs::read_to_string(&contents).unwrap_or_else(|_| "{}".to_owned());
+    let mut known: BTreeMap<u32, String> = serde_json::from_str(&text).unwrap();
+    let writes = std::env::var_os("CIF_WRITE_FORMATS").is_some();
+    for (format, scene) in (1..).zip(of_every_format()) {
+        assert_eq!(format::format_of(&scene.field, scene.head.is_some()), format);
+        let path = folder.join(format!("{format}.cif"));
+        if writes && !known.contains_key(&format) {
+            scene.save(&path).unwrap();
+            known.insert(format, scene.field.fingerprint());
+        }
+    }
+    if writes {
+        fs::write(&contents, serde_json::to_string_pretty(&known).unwrap() + "\n").unwrap();
+    }
+    assert_eq!(known.keys().copied().collect::<Vec<_>>(), (1..=FORMAT).collect::<Vec<_>>());
+    for (format, fingerprint) in known {
+        let path = folder.join(format!("{format}.cif"));
+        let bytes = fs::read(&path).unwrap();
+        let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).unwrap();
+        assert_eq!(header.metadata().as_ref().unwrap()["cif.format"], format.to_string());
+        let loaded = Checkpoint::load(&path).unwrap();
+        assert_eq!(loaded.field.fingerprint(), fingerprint, "format {format}");
+        assert_eq!(loaded.field.cameras.len(), 4);
+        assert_eq!(loaded.head.is_some(), format >= 7);
+        let joints =
+            loaded.field.tracks.iter().flat_map(|tracks| &tracks.groups).filter_map(|group| group.joint);
+        assert_eq!(joints.count(), usize::from(format >= 6));
+    }
+}

@@ -48,7 +48,7 @@ impl Record {
     /// When it is there and cannot be read.
     pub(super) fn read(folder: &Path) -> Result<Self, Error> {
         let path = folder.join(NAME);
-        let lock = if folder.is_dir() { Lock::take(&path)? } else { None };
+        let lock = if folder.is_dir() { Some(Lock::take(&path)?) } else { None };
         if !path.exists() {
             return Ok(Self { path, steps: BTreeMap::new(), lock });
         }
@@ -120,7 +120,7 @@ impl Record {
 
     fn put(&mut self, name: &str, step: Step) -> Result<(), Error> {
         if self.lock.is_none() {
-            self.lock = Lock::take(&self.path)?;
+            self.lock = Some(Lock::take(&self.path)?);
         }
         self.steps.insert(name.to_owned(), step);
         self.write()
