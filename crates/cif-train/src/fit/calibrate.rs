@@ -60,19 +60,8 @@ impl Calibration {
     }
 }
 
-/// Measures steps of the fine stage for about `limit_s`, with the points of the capture split into as many Gaussians as
-/// there will be; nothing is kept.
-///
-/// # Errors
-/// As [`Trainer::new`].
-pub fn calibrate(
-    dataset: &Dataset,
-    config: &TrainConfig,
-    clock: &Arc<dyn Clock>,
-    on: BudgetClock,
-    threads: usize,
-    limit_s: f64,
-) -> Result<Calibration, TrainError> {
+/// A capture that trains on a few of its frames.
+pub(super) fn few_training_frames(dataset: &Dataset) -> Dataset {
     let mut few = dataset.clone();
     let training: Vec<usize> = few
         .frames
@@ -86,6 +75,23 @@ pub fn calibrate(
     for index in training.into_iter().filter(|index| !chosen.contains(index)) {
         few.frames[index].split = Split::Val;
     }
+    few
+}
+
+/// Measures steps of the fine stage for about `limit_s`, with the points of the capture split into as many Gaussians as
+/// there will be; nothing is kept.
+///
+/// # Errors
+/// As [`Trainer::new`].
+pub fn calibrate(
+    dataset: &Dataset,
+    config: &TrainConfig,
+    clock: &Arc<dyn Clock>,
+    on: BudgetClock,
+    threads: usize,
+    limit_s: f64,
+) -> Result<Calibration, TrainError> {
+    let few = few_training_frames(dataset);
     let mut config = config.clone();
     config.report.withhold = 0;
     config.motion.guidance = 0.0;

@@ -176,7 +176,9 @@ pub(super) fn best_way<'a>(
     } else {
         return Ok(None);
     };
-    let moves = decide(&errors(&trials), outline)
+    let followed = trials.iter().find(|trial| trial.way == Way::Followed);
+    let is_shown = || followed.is_some_and(|followed| contest.shows(&followed.fit.poses));
+    let moves = decide(&meant(errors(&trials), outline, is_shown), outline)
         .filter(|(way, _)| object.is_told || !rests(&trials, *way, REST_GAIN[1]));
     let Some((way, rotation)) = moves else { return Ok(None) };
     if rotation == RotationEvidence::Assumed && !object.is_told && !turns(|way| error_of(&trials, way), way) {
@@ -537,6 +539,16 @@ fn errors(trials: &[Trial<'_>]) -> Vec<(Way, f64)> {
     trials.iter().map(|trial| (trial.way, trial.losses[1])).collect()
 }
 
+/// Ways without that of following where it tells nothing: it turns what is round so that shading stays on it, and the images
+/// show no such turn.
+fn meant(mut tried: Vec<(Way, f64)>, outline: &Outline, is_shown: impl FnOnce() -> bool) -> Vec<(Way, f64)> {
+    let is_followed = |(way, _): &(Way, f64)| *way == Way::Followed;
+    if is_round(outline) && tried.len() > 1 && tried.iter().any(is_followed) && !is_shown() {
+        tried.retain(|tried| !is_followed(tried));
+    }
+    tried
+}
+
 /// The best way of moving, by the errors of those that were tried, and whether the pictures tell its turns.
 fn decide(tried: &[(Way, f64)], outline: &Outline) -> Option<(Way, RotationEvidence)> {
     let (is_round, in_contact) = (is_round(outline), outline.air.is_empty());
@@ -623,6 +635,27 @@ mod tests {
         assert_eq!(decide(&[slides[0], (Way::Followed, 0.05)], &round), followed);
         assert_eq!(decide(&[slides[0], (Way::Followed, 0.09)], &round), assumed(Way::Slide(0)));
         assert_eq!(decide(&[slides[0], (Way::Followed, 0.2)], &edgy), observed(Way::Slide(0)));
+    }
+
+    #[test]
+    fn a_ball_that_is_followed_without_a_turn_that_shows_rolls() {
+        // Errors of a ball that is thrown before a rig, bounces and rolls to rest.
+        let tried = vec![
+            (Way::Rest, 0.457),
+            (Way::Slide(0), 0.0685),
+            (Way::Slide(180), 0.0656),
+            (Way::Roll(0.96), 0.0776),
+            (Way::Roll(1.0), 0.0865),
+            (Way::Followed, 0.0557),
+        ];
+        let outline = |roundness: f64| shaped((0.035, 0.035), roundness, BTreeMap::new());
+        let decided = |roundness: f64, is_shown: bool| {
+            let outline = outline(roundness);
+            decide(&meant(tried.clone(), &outline, || is_shown), &outline)
+        };
+        assert_eq!(decided(1.0, false), Some((Way::Roll(1.0), RotationEvidence::Assumed)));
+        assert_eq!(decided(1.0, true), Some((Way::Followed, RotationEvidence::Observed)));
+        assert_eq!(decided(0.8, false), Some((Way::Followed, RotationEvidence::Observed)));
     }
 
     #[test]

@@ -4,6 +4,7 @@
 mod accuracy;
 mod compare;
 mod export;
+mod growth;
 mod hardness;
 
 use std::collections::BTreeMap;
@@ -47,6 +48,7 @@ pub(super) struct Bench {
 #[derive(Debug, Subcommand)]
 enum What {
     Step(Step),
+    Growth(growth::BenchGrowth),
     Export(export::BenchExport),
     Hardness(hardness::BenchHardness),
     Accuracy(accuracy::BenchAccuracy),
@@ -147,7 +149,7 @@ pub(super) fn parts(words: &[String], folder: &std::path::Path) -> Result<Vec<ci
     match Line::try_parse_from(line).map_err(Error::plain)?.what {
         What::Accuracy(command) => accuracy::parts(command, folder),
         What::Compare(command) => compare::parts(&command, folder),
-        What::Step(_) | What::Export(_) | What::Hardness(_) => Err(Error::usage(
+        What::Step(_) | What::Growth(_) | What::Export(_) | What::Hardness(_) => Err(Error::usage(
             format!("cif bench {} has no parts", words.first().map_or("", String::as_str)),
             "benches of a plan are accuracy and compare; others are a [[step]] with each = \"batch\"",
         )),
@@ -157,6 +159,7 @@ pub(super) fn parts(words: &[String], folder: &std::path::Path) -> Result<Vec<ci
 pub(super) fn run(command: &Bench) -> Result<(), Error> {
     match &command.what {
         What::Step(command) => step(command),
+        What::Growth(command) => growth::run(command),
         What::Export(command) => export::run(command),
         What::Hardness(command) => hardness::run(command),
         What::Accuracy(command) => accuracy::run(command),

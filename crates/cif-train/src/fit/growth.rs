@@ -1,0 +1,63 @@
+//! Cost of a step by the number of Gaussians and of pixels.
+
+use std::time::{Duration, Instant};
+
+use cif_dataset::Dataset;
+use cif_field::Field;
+
+use super::calibrate::few_training_frames;
+use crate::config::TrainConfig;
+use crate::error::TrainError;
+use crate::stage::Stage;
+use crate::times::StepTimes;
+use crate::trainer::{InstancePass, Trainer};
+
+/// Steps before measuring.
+const WARM_UP: usize = 2;
+
+/// Fewest steps that are measured, and the most.
+const STEPS: (usize, usize) = (3, 50);
+
+/// Steps of the fine stage with some number of Gaussians.
+pub struct Grown {
+    /// Gaussians.
+    pub gaussians: usize,
+    /// Width and height of the images.
+    pub image_size: [u32; 2],
+    /// Steps measured.
+    pub steps: Vec<StepTimes>,
+}
+
+/// Measures steps of the fine stage, for about as long as `limit`, with the points of the capture, or the Gaussians of a
+/// scene, split until there are `gaussians`; a share of them moves. Where there are more they are smaller, as in training.
+/// `None` where there are more than that from the start.
+///
+/// # Errors
+/// As [`Trainer::new`]; when the scene has other instances than the capture.
+pub fn grown(
+    dataset: &Dataset,
+    config: &TrainConfig,
+    scene: Option<Field>,
+    (gaussians, moving): (usize, f64),
+    limit: Duration,
+) -> Result<Option<Grown>, TrainError> {
+    let mut config = config.clone();
+    config.report.withhold = 0;
+    config.motion.guidance = 0.0;
+    let mut trainer = Trainer::for_measuring(few_training_frames(dataset), config, scene, Stage::Fine, 0)?;
+    if trainer.field().gaussians.len() > gaussians {
+        return Ok(None);
+    }
+    trainer.fill(gaussians, moving);
+    for _ in 0..WARM_UP {
+        trainer.measure_step(InstancePass::Off)?;
+    }
+    let begun = Instant::now();
+    let mut steps = Vec::new();
+    while steps.len() < STEPS.0 || (begun.elapsed() < limit && steps.len() < STEPS.1) {
+        steps.push(trainer.measure_step(InstancePass::Off)?);
+    }
+    let camera = dataset.frames.first().map(|frame| frame.camera);
+    let image_size = camera.map_or([0; 2], |camera| [camera.width, camera.height]);
+    Ok(Some(Grown { gaussians: trainer.field().gaussians.len(), image_size, steps }))
+}
