@@ -177,7 +177,7 @@ pub(super) fn best_way<'a>(
         return Ok(None);
     };
     let followed = trials.iter().find(|trial| trial.way == Way::Followed);
-    let is_shown = || followed.is_some_and(|followed| contest.shows(&followed.fit.poses));
+    let is_shown = || followed.is_some_and(|followed| contest.shows(Way::Followed, &followed.fit.poses));
     let moves = decide(&meant(errors(&trials), outline, is_shown), outline)
         .filter(|(way, _)| object.is_told || !rests(&trials, *way, REST_GAIN[1]));
     let Some((way, rotation)) = moves else { return Ok(None) };
@@ -227,17 +227,20 @@ pub(super) fn best_way<'a>(
     };
     let unturned = simple_errors[1];
     let is_turned = rotation == RotationEvidence::Observed;
-    let rotation = if contest.shows(&fit.poses) { rotation } else { RotationEvidence::Assumed };
+    let rotation = if contest.shows(way, &fit.poses) { rotation } else { RotationEvidence::Assumed };
     // Light, which stays where it is, argues against rolling: how rigid it is shows where it does not turn, too.
     let error = unturned.filter(|_| way == Way::Lies).map_or(losses[1], |unturned| unturned.min(losses[1]));
     Ok(Some(Started { fit, path, way, rotation, is_turned, error, unturned, bent, reference }))
 }
 
 impl<'a> Contest<'a> {
-    /// True where the images show the turns of poses, and not those of any way that differs.
-    fn shows(&self, poses: &Course) -> bool {
+    /// True where the images show the turns of the poses of a way, and not those of any that differs.
+    fn shows(&self, way: Way, poses: &Course) -> bool {
         let (paths, seen) = (&self.paths, (self.object.views, self.object.outline.size()));
         let rivals = paths.ways().into_iter().chain(paths.spins()).map(|way| paths.poses(way));
+        // Paths have their turns among the ways.
+        let twisted = if way == Way::Followed { paths.twisted(poses) } else { Vec::new() };
+        let rivals = rivals.chain(twisted);
         match shown(seen, poses, paths.poses(Way::Slide(0)), rivals) {
             Some(Shown::Turn) => true,
             Some(Shown::NoTurn) => !paths.may_roll(),

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use glam::{DQuat, DVec3};
 
 use super::outline::Outline;
+use super::rotation::Course;
 use super::shape::Pose;
 use super::view::{ObjectView, median};
 
@@ -131,7 +132,7 @@ impl Paths<'_> {
     /// Ways of moving along the path worth a trial, beside sliding without a turn.
     pub(super) fn ways(&self) -> Vec<Way> {
         let mut ways = Vec::new();
-        ways.extend((-180 / SLIDE..=180 / SLIDE).filter(|k| *k != 0).map(|k| Way::Slide(k * SLIDE)));
+        ways.extend(turns().map(Way::Slide));
         if self.may_roll() {
             let radii: &[f64] = if is_round(self.outline) { &ROLLS } else { &OTHER_ROLLS };
             ways.extend(radii.iter().map(|radius| Way::Roll(*radius)));
@@ -181,30 +182,43 @@ impl Paths<'_> {
         self.along.iter().map(pose).collect()
     }
 
+    /// Poses with more turn about the object's own upright axis, by as much as slides turn: an outline that is much the same
+    /// from all sides, as of a bottle, does not show it.
+    pub(super) fn twisted(&self, poses: &Course) -> Vec<Course> {
+        let Some(upright) = poses.get(&self.reference).map(|pose| pose.rotation.inverse() * self.up) else {
+            return Vec::new();
+        };
+        let shares = shares(&poses.values().map(|pose| pose.translation).collect::<Vec<_>>());
+        let origin = poses.range(..self.reference).count();
+        let twisted = |degrees: i32| {
+            let twist = |share: &f64| {
+                let angle = f64::from(degrees).to_radians() * (share - shares[origin]);
+                DQuat::from_scaled_axis(upright * angle)
+            };
+            let pose = |((time, pose), share): ((&usize, &Pose), &f64)| {
+                (*time, Pose { rotation: pose.rotation * twist(share), ..*pose })
+            };
+            poses.iter().zip(&shares).map(pose).collect()
+        };
+        turns().map(twisted).collect()
+    }
+
     /// Poses of a way at the times of the path.
     pub(super) fn poses(&self, way: Way) -> BTreeMap<usize, Pose> {
         let times: Vec<usize> = self.along.keys().copied().collect();
         let places: Vec<DVec3> = self.along.values().copied().collect();
         let origin = times.iter().position(|time| *time == self.reference).unwrap_or(0);
         let turned = |shares: &[f64], degrees: i32| -> Vec<DQuat> {
-            let whole = (shares[shares.len() - 1] - shares[0]).max(1e-9);
             let angle = f64::from(degrees).to_radians();
-            let of =
-                |share: &f64| DQuat::from_scaled_axis(self.up * angle * (share - shares[origin]) / whole);
+            let of = |share: &f64| DQuat::from_scaled_axis(self.up * angle * (share - shares[origin]));
             shares.iter().map(of).collect()
         };
         let rotations = match way {
             Way::Rest => vec![DQuat::IDENTITY; times.len()],
-            Way::Slide(degrees) => {
-                let mut lengths = vec![0.0];
-                for pair in places.windows(2) {
-                    lengths.push(lengths[lengths.len() - 1] + (pair[1] - pair[0]).length());
-                }
-                turned(&lengths, degrees)
-            }
+            Way::Slide(degrees) => turned(&shares(&places), degrees),
             Way::Spin(degrees) => {
                 let steps: Vec<f64> = times.iter().map(|time| *time as f64).collect();
-                turned(&steps, degrees)
+                turned(&of_whole(&steps), degrees)
             }
             Way::Roll(factor) => {
                 let rotations = rolled(&places, self.up, self.outline.height / factor);
@@ -228,6 +242,26 @@ impl Paths<'_> {
     }
 }
 
+/// Turns of slides, degrees in all, but none.
+fn turns() -> impl Iterator<Item = i32> {
+    (-180 / SLIDE..=180 / SLIDE).filter(|k| *k != 0).map(|k| k * SLIDE)
+}
+
+/// Share of the length of a path that lies before each place.
+fn shares(places: &[DVec3]) -> Vec<f64> {
+    let mut lengths = vec![0.0];
+    for pair in places.windows(2) {
+        lengths.push(lengths[lengths.len() - 1] + (pair[1] - pair[0]).length());
+    }
+    of_whole(&lengths)
+}
+
+/// Values from the first on, as shares of the whole.
+fn of_whole(values: &[f64]) -> Vec<f64> {
+    let whole = (values[values.len() - 1] - values[0]).max(1e-9);
+    values.iter().map(|value| (value - values[0]) / whole).collect()
+}
+
 /// Turns of a ball that rolls without slip from place to place.
 pub(super) fn rolled(places: &[DVec3], normal: DVec3, radius: f64) -> Vec<DQuat> {
     let mut rotations = vec![DQuat::IDENTITY];
@@ -245,22 +279,51 @@ mod tests {
     use super::*;
 
     #[test]
+    fn poses_are_twisted_about_the_upright_axis_of_the_object() {
+        let along: BTreeMap<usize, DVec3> = (0..11).map(|k| (k, DVec3::X * (0.02 * k as f64))).collect();
+        let outline = shaped((0.1, 0.03), 0.8, along.clone());
+        let paths = paths(&along, &outline);
+        // It is tilted on its way.
+        let tilted = |k: usize| DQuat::from_rotation_y(0.05 * k as f64);
+        let pose = |(k, place): (&usize, &DVec3)| (*k, Pose { rotation: tilted(*k), translation: *place });
+        let poses: Course = along.iter().map(pose).collect();
+        let twisted = paths.twisted(&poses);
+        assert_eq!(twisted.len(), turns().count());
+        for (course, degrees) in twisted.iter().zip(turns()) {
+            assert_eq!(course[&0], poses[&0], "the reference stays");
+            for (k, pose) in course {
+                let about_itself = poses[k].rotation.inverse() * pose.rotation;
+                let turn = f64::from(degrees).to_radians() * 0.1 * *k as f64;
+                assert!(about_itself.angle_between(DQuat::from_rotation_z(turn)) < 1e-6);
+                assert!(
+                    (pose.rotation * DVec3::Z).abs_diff_eq(tilted(*k) * DVec3::Z, 1e-9),
+                    "tilted as before"
+                );
+                assert_eq!(pose.translation, poses[k].translation);
+            }
+        }
+    }
+
+    fn paths<'a>(along: &BTreeMap<usize, DVec3>, outline: &'a Outline) -> Paths<'a> {
+        Paths {
+            along: along.clone(),
+            place: DVec3::ZERO,
+            outline,
+            up: DVec3::Z,
+            stands: true,
+            reference: 0,
+            followed: None,
+            off: Vec::new(),
+            turned: None,
+        }
+    }
+
+    #[test]
     fn what_is_tall_slides_and_what_is_low_may_roll() {
         let along: BTreeMap<usize, DVec3> = (0..20).map(|k| (k, DVec3::X * (0.02 * k as f64))).collect();
         let rolls = |height: f64, radius: f64| {
             let outline = shaped((height, radius), 0.85, along.clone());
-            let paths = Paths {
-                along: along.clone(),
-                place: DVec3::ZERO,
-                outline: &outline,
-                up: DVec3::Z,
-                stands: true,
-                reference: 0,
-                followed: None,
-                off: Vec::new(),
-                turned: None,
-            };
-            paths.ways().iter().any(|way| matches!(way, Way::Roll(_)))
+            paths(&along, &outline).ways().iter().any(|way| matches!(way, Way::Roll(_)))
         };
         assert!(rolls(0.03, 0.1) && rolls(0.05, 0.04));
         assert!(!rolls(0.09, 0.03));
