@@ -134,7 +134,7 @@ def test_exceptions_and_ctrl_c_stop_save_and_are_raised(dataset: cif.Dataset, tm
 
 
 def test_wrong_arguments_are_named(dataset: cif.Dataset, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="draft, standard or paper"):
+    with pytest.raises(ValueError, match="draft, standard, best or paper"):
         cif.train(dataset, preset="quick")
     with pytest.raises(ValueError, match="auto, cpu or wgpu"):
         cif.train(dataset, backend="abacus")

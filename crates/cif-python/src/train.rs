@@ -195,7 +195,7 @@ impl Run {
 /// dataset is an opened capture or its folder. With output, a .cif file, the run is saved there every five minutes,
 /// at the end of each stage and in the end, its settings next to it; without, it is only returned.
 ///
-/// preset is "draft", "standard" (the default) or "paper"; effects says which effects are trained, "auto" (as the
+/// preset is "draft", "standard" (the default), "best" or "paper"; effects says which effects are trained, "auto" (as the
 /// capture calls for), "all" or "none", then single ones on or off, as in "auto,-instances". settings are single
 /// settings by their keys in the settings file, dotted or as dictionaries: {"stages.fine": 500} or {"stages":
 /// {"fine": 500}}. seed makes runs repeatable: same seed and settings, same field. backend is "cpu", "wgpu" (a GPU)
@@ -256,7 +256,7 @@ pub(crate) fn train(
         dataset,
         output,
         typed: Typed {
-            preset: named("preset", preset.unwrap_or("standard"), "draft, standard or paper")?,
+            preset: named("preset", preset.unwrap_or("standard"), "draft, standard, best or paper")?,
             effects: effects.map(str::parse).transpose().map_err(PyValueError::new_err)?,
             settings: flat,
         },

@@ -174,7 +174,7 @@ fn wrong_input_is_named() {
     cif(path, "bench step table --stage identity").fails(2, &["coarse, fine, instance"]);
     cif(path, "bench step table --instances 8").fails(2, &["--stage instance"]);
     cif(path, "bench step table --stage fine --instances 8").fails(2, &["--stage instance"]);
-    cif(path, "bench step nowhere --preset fast").fails(1, &["fast", "draft, standard, paper"]);
+    cif(path, "bench step nowhere --preset fast").fails(1, &["fast", "draft, standard, best, paper"]);
     cif(path, "bench step nowhere --set stages.fien=3").fails(1, &["stages.fine"]);
     cif(path, "bench step table --json no/where.json").fails(1, &["no/where.json"]);
     fs::remove_dir_all(path.join("table/masks")).unwrap();

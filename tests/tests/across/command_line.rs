@@ -177,7 +177,7 @@ fn settings_of_published_scenes_are_taken() {
 fn settings_that_cannot_be_are_refused_before_anything_is_read() {
     let folder = folder();
     let path = folder.path();
-    cif(path, "train nowhere -o a.cif --preset fast").fails(1, &["fast", "draft, standard, paper"]);
+    cif(path, "train nowhere -o a.cif --preset fast").fails(1, &["fast", "draft, standard, best, paper"]);
     cif(path, "train nowhere -o a.cif --set stages.fien=3").fails(1, &["stages.fien", "stages.fine"]);
     cif(path, "train nowhere -o a.cif --set stages.fine=many").fails(1, &["stages.fine"]);
     cif(path, "train nowhere -o a.cif --batch 0").fails(1, &["stages.batch"]);

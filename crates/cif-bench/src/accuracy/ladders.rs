@@ -204,7 +204,7 @@ fn presets(base: &Base) -> Parts {
     let rungs = if base.quick {
         vec![train("", "quick base", &[]), named("draft")]
     } else {
-        vec![named("draft"), named("standard")]
+        vec![named("draft"), named("standard"), named("best")]
     };
     ("Presets", "Named settings, all of them at once.", rungs)
 }

@@ -332,7 +332,7 @@ def train(
     dataset: Dataset | str | os.PathLike[str],
     output: str | os.PathLike[str] | None = None,
     *,
-    preset: Literal["draft", "standard", "paper"] | None = None,
+    preset: Literal["draft", "standard", "best", "paper"] | None = None,
     effects: str | None = None,
     settings: dict[str, Any] | None = None,
     seed: int | None = None,
@@ -346,7 +346,7 @@ def train(
     dataset is an opened capture or its folder. With output, a .cif file, the run is saved there every five minutes,
     at the end of each stage and in the end, its settings next to it; without, it is only returned.
 
-    preset is "draft", "standard" (the default) or "paper"; effects says which effects are trained, "auto" (as the
+    preset is "draft", "standard" (the default), "best" or "paper"; effects says which effects are trained, "auto" (as the
     capture calls for), "all" or "none", then single ones on or off, as in "auto,-instances". settings are single
     settings by their keys in the settings file, dotted or as dictionaries: {"stages.fine": 500} or {"stages":
     {"fine": 500}}. seed makes runs repeatable: same seed and settings, same field. backend is "cpu", "wgpu" (a GPU)

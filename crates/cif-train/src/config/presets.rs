@@ -17,6 +17,7 @@ impl TrainConfig {
         let mut config = match preset {
             Preset::Standard => Self::default(),
             Preset::Draft => draft(),
+            Preset::Best => best(),
             Preset::Paper => paper(layout),
         };
         if let (Layout::DNerf, Some(coarse)) = (layout, without_points(preset)) {
@@ -32,7 +33,7 @@ impl TrainConfig {
 /// Coarse steps of captures that have no points: what objects stand on is then looked for in what these reconstruct.
 fn without_points(preset: Preset) -> Option<u32> {
     match preset {
-        Preset::Standard => Some(2_000),
+        Preset::Standard | Preset::Best => Some(2_000),
         Preset::Draft => Some(1_000),
         Preset::Paper => None,
     }
@@ -54,6 +55,14 @@ fn draft() -> TrainConfig {
     config.resample = ResampleConfig { from: 50, until: 400, every: 50, ..config.resample };
     // They take as long as all steps together.
     config.motion.parts = false;
+    config
+}
+
+fn best() -> TrainConfig {
+    let mut config = TrainConfig { preset: Preset::Best, ..TrainConfig::default() };
+    config.stages.fine = 16_000;
+    config.model.channels = 32;
+    config.densify = DensifyConfig { until: 9_000, max_gaussians: 30_000, ..config.densify };
     config
 }
 

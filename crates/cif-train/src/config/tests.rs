@@ -4,7 +4,7 @@ use super::*;
 
 #[test]
 fn every_preset_is_valid_and_survives_a_round_trip() {
-    for preset in [Preset::Draft, Preset::Standard, Preset::Paper] {
+    for preset in Preset::ALL {
         for layout in Layout::ALL {
             let config = TrainConfig::preset(preset, layout);
             assert_eq!(config.preset, preset);
@@ -40,7 +40,7 @@ fn the_paper_preset_follows_the_dataset_type() {
 #[test]
 fn captures_without_points_are_reconstructed_longer_before_objects_are_looked_for() {
     let coarse = |preset: Preset, layout: Layout| TrainConfig::preset(preset, layout).stages.coarse;
-    for preset in [Preset::Draft, Preset::Standard] {
+    for preset in [Preset::Draft, Preset::Standard, Preset::Best] {
         assert!(coarse(preset, Layout::DNerf) > 3 * coarse(preset, Layout::HyperNerf));
     }
     assert_eq!(coarse(Preset::Paper, Layout::DNerf), coarse(Preset::Paper, Layout::HyperNerf));

@@ -38,7 +38,7 @@ pub(super) struct Plan {
     capture: PathBuf,
     #[command(flatten)]
     pub(super) report: OnlyReport,
-    /// Named settings that the capture would be trained with: draft, standard or paper
+    /// Named settings that the capture would be trained with: draft, standard, best or paper
     #[arg(long, value_name = "NAME", default_value = "standard")]
     preset: String,
     /// Effects: auto (as the capture calls for), all (as the preset says) or none, then single ones

@@ -25,8 +25,6 @@ the preset `standard`. Values that a preset has for captures of some layouts onl
 number questions that the publication of the method leaves open.
 ";
 
-const PRESETS: [Preset; 3] = [Preset::Draft, Preset::Standard, Preset::Paper];
-
 /// The layout whose presets are those of all.
 const COMMON: Layout = Layout::Colmap;
 
@@ -88,18 +86,18 @@ fn write_values(page: &mut String, key: &str) {
         Some(value) => format!("`{value}`"),
         None => "none".to_owned(),
     };
-    let common = PRESETS.map(|preset| value(preset, COMMON));
+    let common = Preset::ALL.map(|preset| value(preset, COMMON));
     if common.iter().all(|value| *value == common[0]) {
         writeln!(page, "- Value in every preset: {}", common[0]).unwrap();
     } else {
-        let named: Vec<String> = PRESETS
+        let named: Vec<String> = Preset::ALL
             .iter()
             .zip(&common)
             .map(|(preset, value)| format!("{} in `{}`", value, name_of(*preset)))
             .collect();
         writeln!(page, "- Value: {}", named.join(", ")).unwrap();
     }
-    for (preset, common) in PRESETS.iter().zip(&common) {
+    for (preset, common) in Preset::ALL.iter().zip(&common) {
         let mut layouts: BTreeMap<String, Vec<String>> = BTreeMap::new();
         for layout in Layout::ALL {
             let own = value(*preset, layout);

@@ -86,7 +86,7 @@ pub(super) struct BenchAccuracy {
     /// Any setting of that preset by its key, e.g. --paper-set densify.max_gaussians=20000; may be repeated
     #[arg(long, value_name = "TABLE.KEY=VALUE", conflicts_with = "quick")]
     paper_set: Vec<String>,
-    /// Named settings of the base: draft, standard or paper [default: standard]
+    /// Named settings of the base: draft, standard, best or paper [default: standard]
     #[arg(long, value_name = "NAME")]
     preset: Option<String>,
     /// Any setting of the base by its key in SCENE.train.toml, e.g. --set seed=3

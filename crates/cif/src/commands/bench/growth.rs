@@ -52,7 +52,7 @@ pub(super) struct BenchGrowth {
     /// Replace existing output
     #[arg(long)]
     force: bool,
-    /// Named settings: draft, standard or paper [default: standard]
+    /// Named settings: draft, standard, best or paper [default: standard]
     #[arg(long, value_name = "NAME")]
     preset: Option<String>,
     #[command(flatten)]

@@ -51,7 +51,7 @@ pub(super) struct BenchHardness {
     /// Only these variants
     #[arg(long, value_name = "NAME,...", value_delimiter = ',')]
     only: Vec<String>,
-    /// Named settings: draft, standard or paper [default: draft]
+    /// Named settings: draft, standard, best or paper [default: draft]
     #[arg(long, value_name = "NAME")]
     preset: Option<String>,
     /// Any setting by its key in SCENE.train.toml, e.g. --set stages.fine=500

@@ -96,7 +96,7 @@ struct Step {
     /// Replace existing output
     #[arg(long)]
     force: bool,
-    /// Named settings: draft, standard or paper [default: standard]
+    /// Named settings: draft, standard, best or paper [default: standard]
     #[arg(long, value_name = "NAME")]
     preset: Option<String>,
     /// Any setting by its key in SCENE.train.toml, e.g. --set stages.batch=2

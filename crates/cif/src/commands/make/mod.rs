@@ -60,7 +60,7 @@ pub(super) struct Make {
     /// Masks of all frames, or a file for each frame of the video, so that none has to be painted
     #[arg(long, value_name = "DIR")]
     masks: Option<PathBuf>,
-    /// Named settings of the training: draft, standard or paper [default: standard]
+    /// Named settings of the training: draft, standard, best or paper [default: standard]
     #[arg(long, value_name = "NAME")]
     preset: Option<String>,
     /// Settings file of the training

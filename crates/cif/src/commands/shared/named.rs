@@ -12,7 +12,10 @@ use crate::error::Error;
 /// When there is none of this name.
 pub(in crate::commands) fn preset(name: &str, place: &str) -> Result<Preset, Error> {
     serde_json::from_value(serde_json::Value::String(name.to_owned())).map_err(|_| {
-        Error::failed(format!("{place}: there is no preset `{name}`"), "presets: draft, standard, paper")
+        Error::failed(
+            format!("{place}: there is no preset `{name}`"),
+            "presets: draft, standard, best, paper",
+        )
     })
 }
 

@@ -40,8 +40,8 @@ written next to the scene as SCENE.train.toml, which --config accepts again.
 
 Measured: draft on examples/tabletop-mini (60 frames of 128 x 96) takes 41 s on two cores and reaches
 29.2 dB PSNR and 97 % mIoU on held-out frames (make demo);
-standard on a capture of 256 x 192 took five minutes on two cores and reached 31.1 dB and 99 %; paper is
-not measured. `cif bench accuracy` measures this on your capture and machine.
+standard on a capture of 256 x 192 took four minutes on one core and reached 32.6 dB and 99 %, best twelve
+and 33.0 dB; paper is not measured. `cif bench accuracy` measures this on your capture and machine.
 
 Other masks or variants on one reconstruction, without training it again (settings that are not given
 are those of the scene it comes from):
@@ -111,7 +111,7 @@ pub(super) struct Train {
     debug_validation: bool,
     #[arg(from_global)]
     quiet: bool,
-    /// Named settings: draft, standard or paper [default: standard]
+    /// Named settings: draft, standard, best or paper [default: standard]
     #[arg(long, value_name = "NAME")]
     preset: Option<String>,
     /// Settings file; it may hold only the settings that differ

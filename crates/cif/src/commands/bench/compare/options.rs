@@ -68,7 +68,7 @@ pub(in crate::commands::bench) struct BenchCompare {
     /// Number of seeds, from that of the settings on
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=100))]
     pub(super) seeds: u32,
-    /// Named settings: draft, standard or paper [default: standard]
+    /// Named settings: draft, standard, best or paper [default: standard]
     #[arg(long, value_name = "NAME")]
     pub(super) preset: Option<String>,
     /// Steps of the instance stage of every head: a number, or `published` for those of its publication
