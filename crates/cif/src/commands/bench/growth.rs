@@ -4,18 +4,17 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use cif_geometry::stats::median;
-use cif_train::TrainConfig;
 use cif_train::fit::{Grown, grown};
+use cif_train::metrics::training_config;
+use cif_train::{Preset, TrainConfig};
 use clap::Args;
 use serde::Serialize;
 
-use crate::commands::shared::named::preset;
 use crate::commands::shared::{CaptureOptions, print_warnings, scene};
 use crate::error::Error;
 use crate::messages::note;
 use crate::output::Outputs;
 use crate::report::{JsonReport, Report as ReportOption};
-use crate::settings::Layers;
 
 /// Longest time that steps of one number of Gaussians and pixels are measured, three steps aside.
 const LIMIT: Duration = Duration::from_secs(3);
@@ -33,7 +32,7 @@ proportional, 0 is no growth. Nothing is kept.
 pub(super) struct BenchGrowth {
     /// Folder of the capture
     capture: PathBuf,
-    /// Trained scene whose Gaussians are split; settings come from it
+    /// Trained scene whose Gaussians are split, and whose settings are taken [default: those of `standard`]
     #[arg(long, value_name = "SCENE.cif")]
     scene: Option<PathBuf>,
     /// Numbers of Gaussians
@@ -52,9 +51,6 @@ pub(super) struct BenchGrowth {
     /// Replace existing output
     #[arg(long)]
     force: bool,
-    /// Named settings: draft, standard, best or paper [default: standard]
-    #[arg(long, value_name = "NAME")]
-    preset: Option<String>,
     #[command(flatten)]
     capture_options: CaptureOptions,
 }
@@ -147,13 +143,8 @@ pub(super) fn run(command: &BenchGrowth) -> Result<(), Error> {
         if cells.is_empty() {
             print_warnings(&dataset);
         }
-        let config = match (&command.preset, field.as_ref().and_then(cif_train::metrics::training_config)) {
-            (None, Some(trained)) => trained,
-            (name, _) => {
-                let name = name.as_deref().map(|name| preset(name, "--preset")).transpose()?;
-                Layers::new(TrainConfig::preset(name.unwrap_or_default(), dataset.layout)).validated()?
-            }
-        };
+        let trained = field.as_ref().and_then(training_config);
+        let config = trained.unwrap_or_else(|| TrainConfig::preset(Preset::default(), dataset.layout));
         for gaussians in &command.gaussians {
             let moving = f64::from(command.moving) / 100.0;
             let wanted = (*gaussians as usize, moving);
