@@ -121,8 +121,10 @@ impl Lock {
                 let left = fs::read_to_string(&path).unwrap_or_default();
                 // The system knows the processes of this machine.
                 let is_dead = is_locked && is_of(&left, &cif_system::host::host());
-                if !is_dead && gives_sign(&path, &left, silence) {
-                    return Err(Busy::Held(held(target, &path)));
+                match if is_dead { Watched::Silent } else { watch(&path, &left, silence) } {
+                    Watched::Silent => {}
+                    Watched::Ended => continue,
+                    Watched::Alive => return Err(Busy::Held(held(target, &path))),
                 }
             }
             let holder = Holder::this();
@@ -188,8 +190,18 @@ fn is_of(left: &str, host: &str) -> bool {
             .is_none_or(|(process, _)| process.split_once(" on ").is_none_or(|(_, machine)| machine == host))
 }
 
-/// True where a lock file changes, or goes, before it was silent for long enough.
-fn gives_sign(path: &Path, left: &str, silence: Duration) -> bool {
+/// The process that has left a lock file, after some time.
+#[derive(Debug, PartialEq, Eq)]
+enum Watched {
+    /// It gave a sign; or nobody waits for one any more.
+    Alive,
+    /// It has removed the file.
+    Ended,
+    Silent,
+}
+
+/// Waits for a sign in a lock file.
+fn watch(path: &Path, left: &str, silence: Duration) -> Watched {
     let silence = if left.is_empty() { silence.min(BEGINNING) } else { silence };
     if silence > BEGINNING {
         eprintln!(
@@ -202,11 +214,13 @@ fn gives_sign(path: &Path, left: &str, silence: Duration) -> bool {
     let begun = Instant::now();
     while begun.elapsed() < silence {
         std::thread::sleep(PAUSE);
-        if interrupt::requested() || fs::read_to_string(path).ok().as_deref() != Some(left) {
-            return true;
+        match fs::read_to_string(path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Watched::Ended,
+            Ok(now) if now == left && !interrupt::requested() => {}
+            _ => return Watched::Alive,
         }
     }
-    false
+    Watched::Silent
 }
 
 /// Signs of life of a process, until this is dropped.
@@ -325,7 +339,7 @@ mod tests {
                 std::thread::sleep(4 * PAUSE);
                 fs::remove_file(&path).unwrap();
             });
-            drop(Lock::wait(&target).unwrap());
+            drop(Lock::take(&target).unwrap());
         });
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
     }
@@ -339,7 +353,7 @@ mod tests {
         let first = fs::read_to_string(&path).unwrap();
         assert!(is_of(&first, &cif_system::host::host()) && !is_of(&first, "elsewhere"), "{first}");
         assert!(!is_of("", "elsewhere"), "it is being written");
-        assert!(gives_sign(&path, &first, 2 * SIGN));
+        assert_eq!(watch(&path, &first, 2 * SIGN), Watched::Alive);
         let second = fs::read_to_string(&path).unwrap();
         assert_eq!(first.lines().next(), second.lines().next());
         assert_eq!(second.lines().count(), 2);
