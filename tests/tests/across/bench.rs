@@ -124,6 +124,26 @@ fn the_instance_pass_is_compared_for_any_number_of_instances() {
 }
 
 #[test]
+fn growth_is_measured_by_gaussians_and_pixels() {
+    let folder = with_capture();
+    let path = folder.path();
+    let line = "bench growth table --threads 2 --reductions 1,2";
+    let report = json(&cif(path, &format!("{line} --gaussians 400,1200 --json -")).succeeds().stdout);
+    let cells = report["cells"].as_array().unwrap();
+    let counts: Vec<&Value> = cells.iter().map(|cell| &cell["gaussians"]).collect();
+    assert_eq!(counts, [400, 1200, 400, 1200], "fewer and more than the points of the capture");
+    let width = |cell: usize| cells[cell]["image_size"][0].as_u64().unwrap();
+    assert_eq!((width(0), width(2)), (width(1), width(0) / 2));
+    assert!(cells.iter().all(|cell| cell["ms"].as_f64() > Some(0.0) && cell["steps"].as_u64() >= Some(3)));
+    for slopes in ["by_gaussians", "by_pixels"] {
+        let slopes = report[slopes].as_array().unwrap();
+        assert!(slopes.len() == 2 && slopes.iter().all(|slope| slope["exponent"].is_number()), "{report:#}");
+    }
+    let pairs = |cell: usize| cells[cell]["evaluated_pairs"].as_f64().unwrap();
+    assert!(pairs(0) > pairs(2), "{report:#}");
+}
+
+#[test]
 fn the_ladder_of_tolerances_tells_what_gltf_misses() {
     let folder = with_capture();
     let path = folder.path();

@@ -29,8 +29,8 @@ pub struct Grown {
 }
 
 /// Measures steps of the fine stage, for about as long as `limit`, with the points of the capture, or the Gaussians of a
-/// scene, split until there are `gaussians`; a share of them moves. Where there are more they are smaller, as in training.
-/// `None` where there are more than that from the start.
+/// scene, thinned out evenly or split until there are `gaussians`; a share of them moves. Those that are split are smaller,
+/// as in training.
 ///
 /// # Errors
 /// As [`Trainer::new`]; when the scene has other instances than the capture.
@@ -40,14 +40,13 @@ pub fn grown(
     scene: Option<Field>,
     (gaussians, moving): (usize, f64),
     limit: Duration,
-) -> Result<Option<Grown>, TrainError> {
+) -> Result<Grown, TrainError> {
     let mut config = config.clone();
     config.report.withhold = 0;
     config.motion.guidance = 0.0;
+    config.model.max_initial_points = config.model.max_initial_points.min(gaussians as u32);
+    let scene = scene.map(|scene| thinned(scene, gaussians));
     let mut trainer = Trainer::for_measuring(few_training_frames(dataset), config, scene, Stage::Fine, 0)?;
-    if trainer.field().gaussians.len() > gaussians {
-        return Ok(None);
-    }
     trainer.fill(gaussians, moving);
     for _ in 0..WARM_UP {
         trainer.measure_step(InstancePass::Off)?;
@@ -59,5 +58,15 @@ pub fn grown(
     }
     let camera = dataset.frames.first().map(|frame| frame.camera);
     let image_size = camera.map_or([0; 2], |camera| [camera.width, camera.height]);
-    Ok(Some(Grown { gaussians: trainer.field().gaussians.len(), image_size, steps }))
+    Ok(Grown { gaussians: trainer.field().gaussians.len(), image_size, steps })
+}
+
+/// A scene with so many of its Gaussians at most, spread evenly over its rows.
+fn thinned(scene: Field, most: usize) -> Field {
+    let count = scene.gaussians.len();
+    if count <= most {
+        return scene;
+    }
+    let rows: Vec<u32> = (0..most).map(|k| (k * count / most) as u32).collect();
+    scene.gather(&rows)
 }
