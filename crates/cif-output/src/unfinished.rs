@@ -17,12 +17,12 @@ const PREFIX: &str = ".cif-tmp-";
 /// takes that long to write a file; chosen.
 const LEFT_ELSEWHERE: Duration = Duration::from_secs(24 * 3600);
 
-/// End of the names of temporary files of this machine.
+/// End of the names of temporary files of this machine; elsewhere than on Unix the same on all.
 fn of_this_machine() -> String {
     #[cfg(unix)]
     let name = rustix::system::uname().nodename().to_string_lossy().into_owned();
     #[cfg(not(unix))]
-    let name = std::env::var("COMPUTERNAME").unwrap_or_default();
+    let name = String::new();
     format!("@{}", name.replace(|letter: char| !letter.is_ascii_alphanumeric(), "-"))
 }
 
