@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -41,6 +42,13 @@ def camera_at(x: float) -> cif.Camera:
     pose[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
     pose[:3, 3] = -pose[:3, :3] @ [x, -4, 1]
     return cif.Camera(64, 48, (60.0, 58.0), (30.0, 25.0), pose)
+
+
+def answer_of(capfd: pytest.CaptureFixture[str], *words: object) -> dict:
+    """The JSON that a command prints."""
+    capfd.readouterr()
+    assert cif.run([*map(str, words), "--json"]) == 0
+    return json.loads(capfd.readouterr().out)
 
 
 def make_field() -> cif.Field:

@@ -5,14 +5,13 @@ Those of a version that has none are written, which fails once; those that are t
 
 from __future__ import annotations
 
-import json
 from importlib import metadata
 from pathlib import Path
 
 import cif
 import numpy as np
 import pytest
-from conftest import LABELS, TIMES, make_field, motion_of
+from conftest import LABELS, TIMES, answer_of, make_field, motion_of
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 EXAMPLE = REPOSITORY / "examples" / "tabletop-mini"
@@ -54,12 +53,6 @@ def folders() -> list[Path]:
     return sorted(FORMATS.iterdir())
 
 
-def told(capfd: pytest.CaptureFixture[str], *words: object) -> dict:
-    capfd.readouterr()
-    assert cif.run([*map(str, words), "--json"]) == 0
-    return json.loads(capfd.readouterr().out)
-
-
 @pytest.fixture(params=folders(), ids=lambda folder: folder.name)
 def folder(request: pytest.FixtureRequest) -> Path:
     """Files of one version."""
@@ -71,7 +64,7 @@ def test_scenes_in_motion_are_read(
     folder: Path, name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     home = tmp_path / "home.cif"
-    told(capfd, "import", folder / name, "-o", home)
+    answer_of(capfd, "import", folder / name, "-o", home)
     found, was = cif.Field.load(home), cif.Field.load(folder / "scene.cif")
     instances = [(each["id"], each["label"], each["category"]) for each in found.instances]
     assert instances == [(each["id"], each["label"], each["category"]) for each in LABELS]
@@ -88,7 +81,7 @@ def test_scenes_in_motion_are_read(
 
 
 def test_splats_are_read(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    told(capfd, "import", folder / PLY, "-o", tmp_path / "home.cif")
+    answer_of(capfd, "import", folder / PLY, "-o", tmp_path / "home.cif")
     found, was = cif.Field.load(tmp_path / "home.cif"), cif.Field.load(folder / "scene.cif")
     np.testing.assert_allclose(found.means, was.means, atol=1e-6)
 
@@ -99,4 +92,4 @@ def test_training_goes_on(folder: Path, tmp_path: Path, capfd: pytest.CaptureFix
     assert cif.run(["train", str(EXAMPLE), "--resume", "-o", str(path)]) == 0
     printed = capfd.readouterr().err
     assert "fine: 4 steps" in printed and "coarse:" not in printed
-    assert told(capfd, "info", path)["gaussians"] > 0
+    assert answer_of(capfd, "info", path)["gaussians"] > 0

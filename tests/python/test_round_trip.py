@@ -12,7 +12,7 @@ from pathlib import Path
 import cif
 import numpy as np
 import pytest
-from conftest import camera_at
+from conftest import answer_of, camera_at
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSemantics
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -80,12 +80,6 @@ def edit(path: Path) -> None:
     stage.Save()
 
 
-def told(capfd: pytest.CaptureFixture[str], *words: object) -> dict:
-    capfd.readouterr()
-    assert cif.run([*map(str, words), "--json"]) == 0
-    return json.loads(capfd.readouterr().out)
-
-
 def changes(objects: list[dict]) -> dict[str, dict]:
     """What is said about every object that differs, without what is the same."""
     quiet = {"id", "name", "label", "splat_count", "kind"}
@@ -125,18 +119,18 @@ def test_exactly_the_edits_come_home(
 ) -> None:
     path, home = tmp_path / name, tmp_path / "home.cif"
     assert cif.run(["export", str(base), "--usd", str(path)]) == 0
-    same = told(capfd, "import", path, "--base", base, "-o", tmp_path / "same.cif")
+    same = answer_of(capfd, "import", path, "--base", base, "-o", tmp_path / "same.cif")
     assert (same["objects"], same["unchanged"], same["cameras"]) == ([], len(NAMES) + 1, [])
     edit(path)
-    listed = told(capfd, "import", path, "--base", base, "-o", home)
+    listed = answer_of(capfd, "import", path, "--base", base, "-o", home)
     check(listed, "duplicated")
     # Two scenes have no rows in common that tell a copy from a new object.
-    check(told(capfd, "diff", base, home), "added")
+    check(answer_of(capfd, "diff", base, home), "added")
     # As the file has it, so has the scene, but for names, which follow labels and ids.
-    names = changes(told(capfd, "diff", path, home)["objects"])
+    names = changes(answer_of(capfd, "diff", path, home)["objects"])
     assert sorted(names) == ["added vase", "changed salad bowl", "removed vase"]
     assert names["changed salad bowl"].keys() == {"renamed"}
-    assert told(capfd, "diff", home, home)["unchanged"] == len(NAMES) + 1, "one less, one more"
+    assert answer_of(capfd, "diff", home, home)["unchanged"] == len(NAMES) + 1, "one less, one more"
     before, after = cif.Field.load(base), cif.Field.load(home)
     np.testing.assert_array_equal(
         after.means[:EACH], before.means[:EACH], "moved by its motion, not its splats"
@@ -220,7 +214,7 @@ def test_value_clips_stay_in_the_folder(
         home = path.with_suffix(".cif")
         assert cif.run(["import", str(path), "-o", str(home), *words]) == 0
         # A scene of one moment has no other to ask for.
-        (found,) = told(capfd, "query", home, "--label", "thing", *([] if template else ["--time", 1]))
+        (found,) = answer_of(capfd, "query", home, "--label", "thing", *([] if template else ["--time", 1]))
         return (found["low"][2] + found["high"][2]) / 2
 
     assert height_of(stage_with_clips(tmp_path / "inside", f"./{asset}", template)) == pytest.approx(height)

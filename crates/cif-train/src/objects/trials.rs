@@ -542,7 +542,7 @@ fn errors(trials: &[Trial<'_>]) -> Vec<(Way, f64)> {
     trials.iter().map(|trial| (trial.way, trial.losses[1])).collect()
 }
 
-/// Ways without that of following where it tells nothing: it turns what is round so that shading stays on it, and the images
+/// Ways without that of following where it shows nothing: it turns what is round so that shading stays on it, and the images
 /// show no such turn.
 fn meant(mut tried: Vec<(Way, f64)>, outline: &Outline, is_shown: impl FnOnce() -> bool) -> Vec<(Way, f64)> {
     let is_followed = |(way, _): &(Way, f64)| *way == Way::Followed;
