@@ -1,5 +1,6 @@
 //! Ways of moving held against each other: each is fitted to some views, and judged on others that were left out.
 
+use std::cell::OnceCell;
 use std::collections::BTreeMap;
 
 use cif_field::tracks::RotationEvidence;
@@ -177,7 +178,12 @@ pub(super) fn best_way<'a>(
         return Ok(None);
     };
     let followed = trials.iter().find(|trial| trial.way == Way::Followed);
-    let is_shown = || followed.is_some_and(|followed| contest.shows(Way::Followed, &followed.fit.poses));
+    let shown = OnceCell::new();
+    let is_shown = || {
+        *shown.get_or_init(|| {
+            followed.is_some_and(|followed| contest.shows(Way::Followed, &followed.fit.poses))
+        })
+    };
     let moves = decide(&meant(errors(&trials), outline, is_shown), outline)
         .filter(|(way, _)| object.is_told || !rests(&trials, *way, REST_GAIN[1]));
     let Some((way, rotation)) = moves else { return Ok(None) };
@@ -227,7 +233,11 @@ pub(super) fn best_way<'a>(
     };
     let unturned = simple_errors[1];
     let is_turned = rotation == RotationEvidence::Observed;
-    let rotation = if contest.shows(way, &fit.poses) { rotation } else { RotationEvidence::Assumed };
+    let is_shown = match shown.get() {
+        Some(is_shown) if way == Way::Followed => *is_shown,
+        _ => contest.shows(way, &fit.poses),
+    };
+    let rotation = if is_shown { rotation } else { RotationEvidence::Assumed };
     // Light, which stays where it is, argues against rolling: how rigid it is shows where it does not turn, too.
     let error = unturned.filter(|_| way == Way::Lies).map_or(losses[1], |unturned| unturned.min(losses[1]));
     Ok(Some(Started { fit, path, way, rotation, is_turned, error, unturned, bent, reference }))

@@ -31,7 +31,7 @@ proportional, 0 is no growth. Nothing is kept.
 pub(super) struct BenchGrowth {
     /// Folder of the capture
     capture: PathBuf,
-    /// Trained scene whose Gaussians are split, and whose settings are taken [default: those of `standard`]
+    /// Trained scene whose Gaussians are taken, with its settings [default: the points and `standard`]
     #[arg(long, value_name = "SCENE.cif")]
     scene: Option<PathBuf>,
     /// Numbers of Gaussians
