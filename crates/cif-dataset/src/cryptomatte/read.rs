@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 use std::path::{Component, Path};
 
 use cif_geometry::PixelGrid;
-use exr::prelude::{AttributeValue, FlatSamples, ReadChannels, ReadLayers, Text, read as read_exr};
+use exr::prelude::{AttributeValue, FlatSamples};
 
 use super::{CONVERSION, Cryptomatte, HASH, object_id};
 use crate::Error;
-use crate::files::exr_header;
+use crate::files::exr::Headers;
 
 /// Cryptomatte metadata in the header of a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -28,23 +28,22 @@ pub struct Header {
 /// # Errors
 /// When the file is missing, damaged, no EXR, or has no Cryptomatte with a manifest.
 pub fn read_header(path: &Path) -> Result<Header, Error> {
-    let (meta, (width, height)) = exr_header::read(path)?;
+    header_of(path, &Headers::read(path)?)
+}
+
+/// Cryptomatte metadata among the attributes of a file.
+fn header_of(path: &Path, headers: &Headers) -> Result<Header, Error> {
     // Multi-part files keep the metadata in one part, which need not be that of the layer.
-    let mut texts: BTreeMap<String, String> = BTreeMap::new();
-    for header in &meta.headers {
-        for map in [&header.own_attributes.other, &header.shared_attributes.other] {
-            #[allow(clippy::iter_over_hash_type, reason = "collected into an ordered map")]
-            for (name, value) in map {
-                if let AttributeValue::Text(text) = value
-                    && name.to_string().starts_with("cryptomatte/")
-                {
-                    // Names of objects are UTF-8; `to_string` would take each byte for a character.
-                    let text = String::from_utf8_lossy(text.as_slice()).into_owned();
-                    texts.insert(name.to_string(), text);
-                }
+    let texts: BTreeMap<String, String> = headers
+        .attributes()
+        .filter_map(|(name, value)| match value {
+            // Names of objects are UTF-8; `to_string` would take each byte for a character.
+            AttributeValue::Text(text) if name.starts_with("cryptomatte/") => {
+                Some((name, String::from_utf8_lossy(text.as_slice()).into_owned()))
             }
-        }
-    }
+            _ => None,
+        })
+        .collect();
     let (key, layer) = choose_layer(path, &texts)?;
     let text = |name: &str| texts.get(&format!("cryptomatte/{key}/{name}"));
     if let Some(conversion) = text("conversion").filter(|conversion| *conversion != CONVERSION) {
@@ -67,6 +66,7 @@ pub fn read_header(path: &Path) -> Result<Header, Error> {
         }
     };
     let objects = parse_manifest(path, &manifest, text("hash").is_none_or(|hash| hash == HASH))?;
+    let (width, height) = headers.size;
     Ok(Header { layer, width, height, objects })
 }
 
@@ -149,54 +149,25 @@ fn parse_manifest(path: &Path, manifest: &str, hashed: bool) -> Result<BTreeMap<
 /// # Errors
 /// As [`read_header`], and when channels are missing, not 32-bit floats, or the file is truncated.
 pub fn read(path: &Path) -> Result<Cryptomatte, Error> {
-    let header = read_header(path)?;
-    let image = read_exr()
-        .no_deep_data()
-        .largest_resolution_level()
-        .all_channels()
-        .all_layers()
-        .all_attributes()
-        .non_parallel()
-        .from_file(path)
-        .map_err(|error| Error::mask(path, format!("it cannot be decoded ({error}); export it again")))?;
-    let window = image.attributes.display_window.position;
-    let (width, height) = (header.width, header.height);
+    let headers = Headers::read(path)?;
+    let header = header_of(path, &headers)?;
     let mut planes: BTreeMap<(usize, usize), PixelGrid<f32>> = BTreeMap::new();
-    for layer in &image.layer_data {
-        let part = layer.attributes.layer_name.as_ref().map(Text::to_string);
-        for channel in &layer.channel_data.list {
-            let Some((rank, component)) = place_of(&header.layer, part.as_deref(), &channel.name.to_string())
-            else {
-                continue;
-            };
-            let FlatSamples::F32(samples) = &channel.sample_data else {
-                return Err(Error::mask(
-                    path,
-                    format!(
-                        "its channel {} is {}, but Cryptomatte ids survive in 32-bit floats only; export it with full \
-                         float",
-                        channel.name,
-                        if matches!(channel.sample_data, FlatSamples::F16(_)) {
-                            "half"
-                        } else {
-                            "an integer"
-                        }
-                    ),
-                ));
-            };
-            let offset = layer.attributes.layer_position - window;
-            let mut plane = PixelGrid::filled(width, height, 0.0);
-            for (row, values) in samples.chunks_exact(layer.size.x().max(1)).enumerate() {
-                let y = row as i64 + i64::from(offset.y());
-                for (column, value) in values.iter().enumerate() {
-                    let x = column as i64 + i64::from(offset.x());
-                    if (0..i64::from(width)).contains(&x) && (0..i64::from(height)).contains(&y) {
-                        plane.pixels[(y * i64::from(width) + x) as usize] = *value;
-                    }
-                }
-            }
-            planes.insert((rank, component), plane);
-        }
+    for channel in headers.decode()?.channels() {
+        let Some((rank, component)) = place_of(&header.layer, channel.part.as_deref(), &channel.name) else {
+            continue;
+        };
+        let FlatSamples::F32(samples) = channel.samples else {
+            return Err(Error::mask(
+                path,
+                format!(
+                    "its channel {} is {}, but Cryptomatte ids survive in 32-bit floats only; export it with full \
+                     float",
+                    channel.name,
+                    if matches!(channel.samples, FlatSamples::F16(_)) { "half" } else { "an integer" }
+                ),
+            ));
+        };
+        planes.insert((rank, component), channel.plane(samples.iter().copied(), 0.0));
     }
     let levels = planes.keys().map(|(rank, _)| rank + 1).max().unwrap_or(0);
     let mut ranks = Vec::new();

@@ -1,7 +1,7 @@
 //! Readers of single files, each bounded by the size of the file: a header cannot make them allocate more.
 
 pub(crate) mod confidence;
-pub(crate) mod exr_header;
+pub(crate) mod exr;
 pub(crate) mod image;
 pub(crate) mod json;
 pub(crate) mod listing;

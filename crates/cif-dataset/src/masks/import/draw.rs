@@ -8,7 +8,8 @@ use super::coverage::Coverage;
 use super::picture::{Content, Picture, Piece, Place, Shape};
 use super::{mattes, polygon, runs, tracker};
 use crate::Error;
-use crate::files::{exr_header, mask};
+use crate::files::exr::Headers;
+use crate::files::mask;
 use crate::orientation::Turn;
 use crate::sizes::same_aspect;
 
@@ -65,7 +66,7 @@ fn size_of(shape: &Shape) -> Result<Option<(u32, u32)>, Error> {
         Shape::Polygons(_) => None,
         Shape::Runs(_, stated) => *stated,
         Shape::File(path) => Some(mask::size(path)?),
-        Shape::Matte(matte) => Some(exr_header::read(&matte.path)?.1),
+        Shape::Matte(matte) => Some(Headers::read(&matte.path)?.size),
     })
 }
 

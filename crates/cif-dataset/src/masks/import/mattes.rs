@@ -3,13 +3,12 @@
 use std::path::Path;
 
 use cif_geometry::PixelGrid;
-use exr::meta::MetaData;
-use exr::prelude::{FlatSamples, ReadChannels, ReadLayers, Text, read as read_exr};
+use exr::prelude::FlatSamples;
 
 use super::files_below::files_below;
 use super::picture::{Content, Listing, Matte, Picture, Piece, Place, Shape};
 use crate::Error;
-use crate::files::exr_header;
+use crate::files::exr::Headers;
 
 /// From this value on, a matte covers a pixel.
 const HALF: f32 = 0.5;
@@ -18,37 +17,17 @@ const HALF: f32 = 0.5;
 const COMPONENTS: [&str; 12] =
     ["r", "g", "b", "a", "y", "red", "green", "blue", "alpha", "matte", "mask", "z"];
 
-/// Whether the files are Cryptomattes, which are read as masks without import.
+/// True when the files are Cryptomattes, which are read as masks without import.
 pub(super) fn is_cryptomatte(path: &Path) -> Result<bool, Error> {
-    let meta = header(path)?;
-    let names = meta
-        .headers
-        .iter()
-        .flat_map(|header| header.own_attributes.other.keys().chain(header.shared_attributes.other.keys()));
-    Ok(names.into_iter().any(|name| name.to_string().starts_with("cryptomatte/")))
-}
-
-fn header(path: &Path) -> Result<MetaData, Error> {
-    exr_header::read(path).map(|(meta, _)| meta)
+    Ok(Headers::read(path)?.attributes().any(|(name, _)| name.starts_with("cryptomatte/")))
 }
 
 pub(super) fn list(source: &Path) -> Result<Listing, Error> {
     let mut result = Listing::default();
     for (name, path) in files_below(source, &["exr"])? {
-        let meta = header(&path)?;
-        let mut channels = Vec::new();
-        for header in &meta.headers {
-            let part = header.own_attributes.layer_name.as_ref().map(Text::to_string);
-            channels.extend(
-                header
-                    .channels
-                    .list
-                    .iter()
-                    .map(|channel| full_name(part.as_deref(), &channel.name.to_string())),
-            );
-        }
         let mut pieces = Vec::new();
-        for channel in channels {
+        for (part, channel) in Headers::read(&path)?.channels() {
+            let channel = full_name(part.as_deref(), &channel);
             let Some(object) = object_of(&channel) else { continue };
             let object =
                 result.objects.enter(&object, None).map_err(|problem| Error::mask(&path, problem))?;
@@ -106,39 +85,14 @@ fn object_of(channel: &str) -> Option<String> {
 /// When the file is damaged, or lacks the channel.
 pub(super) fn decode(matte: &Matte) -> Result<PixelGrid<bool>, Error> {
     let path = &matte.path;
-    let (meta, size) = exr_header::read(path)?;
-    drop(meta);
-    let image = read_exr()
-        .no_deep_data()
-        .largest_resolution_level()
-        .all_channels()
-        .all_layers()
-        .all_attributes()
-        .non_parallel()
-        .from_file(path)
-        .map_err(|error| Error::mask(path, format!("it cannot be decoded ({error}); export it again")))?;
-    let window = image.attributes.display_window.position;
     let mut planes = Vec::new();
-    for layer in &image.layer_data {
-        let part = layer.attributes.layer_name.as_ref().map(Text::to_string);
-        for channel in &layer.channel_data.list {
-            let name = full_name(part.as_deref(), &channel.name.to_string());
-            if matte.channel.as_ref().is_some_and(|wanted| *wanted != name) {
-                continue;
-            }
-            let offset = layer.attributes.layer_position - window;
-            let mut plane = PixelGrid::filled(size.0, size.1, false);
-            let columns = layer.size.x().max(1);
-            for (at, covered) in samples(&channel.sample_data).enumerate() {
-                let x = (at % columns) as i64 + i64::from(offset.x());
-                let y = (at / columns) as i64 + i64::from(offset.y());
-                if covered && (0..i64::from(size.0)).contains(&x) && (0..i64::from(size.1)).contains(&y) {
-                    plane.pixels[(y * i64::from(size.0) + x) as usize] = true;
-                }
-            }
-            let last = name.rsplit('.').next().unwrap_or_default().to_lowercase();
-            planes.push((last, plane));
+    for channel in Headers::read(path)?.decode()?.channels() {
+        let name = full_name(channel.part.as_deref(), &channel.name);
+        if matte.channel.as_ref().is_some_and(|wanted| *wanted != name) {
+            continue;
         }
+        let last = name.rsplit('.').next().unwrap_or_default().to_lowercase();
+        planes.push((last, channel.plane(samples(channel.samples), false)));
     }
     if let Some(wanted) = &matte.channel {
         let (_, plane) =
