@@ -48,7 +48,7 @@ pub(crate) fn window_of(text: Option<&str>) -> PyResult<Option<TimeWindow>> {
 }
 
 impl Dataset {
-    pub(crate) fn frame_at(&self, index: usize) -> PyResult<&cif_dataset::Frame> {
+    fn frame_at(&self, index: usize) -> PyResult<&cif_dataset::Frame> {
         self.inner.frames.get(index).ok_or_else(|| {
             PyIndexError::new_err(format!("frame {index} of {} frames", self.inner.frames.len()))
         })
@@ -145,13 +145,14 @@ impl Dataset {
     /// what is "rgb" or "instance-color" (the mask in the colours of its instances).
     #[pyo3(signature = (index=0, *, what="rgb"))]
     fn show(&self, py: Python<'_>, index: usize, what: &str) -> PyResult<Picture> {
-        picture::of_frame(py, self, index, what)
+        self.frame_at(index)?;
+        picture::of_frame(py, &self.inner, index, what)
     }
 
     /// The first frame and the counts as a table, for notebooks.
     fn _repr_html_(&self, py: Python<'_>) -> PyResult<String> {
         // An image that cannot be read is an error of what needs it.
-        let frame = picture::of_frame(py, self, 0, "rgb");
+        let frame = self.show(py, 0, "rgb");
         let still = frame.ok().map(|frame| frame.as_html(py)).transpose()?.unwrap_or_default();
         Ok(still + &tables::of_summary(&self.__repr__(), &self.summary(py)?)?)
     }

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use cif::formats;
+use cif_field::{Field, Gaussians};
 use cif_scene::{ExportOptions, FrameRange, MotionSource, SceneFormat, SceneGraph, SceneOptions, Tolerance};
 use numpy::{PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::exceptions::PyValueError;
@@ -10,18 +11,17 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::error::cif_error;
-use crate::field::Field;
 use crate::{arrays, process};
 
 /// Motion from a Python function `time -> (means, quaternions)`. The first error stops the export.
 struct CallableMotion<'a> {
-    field: &'a cif_field::Field,
+    field: &'a Field,
     function: Py<PyAny>,
     error: Option<PyErr>,
 }
 
 impl CallableMotion<'_> {
-    fn call(&self, time: f64) -> PyResult<cif_field::Gaussians> {
+    fn call(&self, time: f64) -> PyResult<Gaussians> {
         Python::attach(|py| {
             let answer = self.function.call1(py, (time,))?;
             let (means, quaternions): (PyReadonlyArrayDyn<'_, f32>, PyReadonlyArrayDyn<'_, f32>) =
@@ -40,7 +40,7 @@ impl CallableMotion<'_> {
 }
 
 impl MotionSource for CallableMotion<'_> {
-    fn gaussians_at(&mut self, time: f64) -> cif_field::Gaussians {
+    fn gaussians_at(&mut self, time: f64) -> Gaussians {
         if self.error.is_none() {
             match self.call(time) {
                 Ok(moved) => return moved,
@@ -93,10 +93,10 @@ fn build(
     motion: Option<Bound<'_, PyAny>>,
 ) -> PyResult<SceneGraph> {
     let Some(function) = motion else {
-        return process::detach(py, || cif_scene::build(&field.inner, options))?.map_err(cif_error);
+        return process::detach(py, || cif_scene::build(field, options))?.map_err(cif_error);
     };
-    let mut source = CallableMotion { field: &field.inner, function: function.unbind(), error: None };
-    let graph = process::detach(py, || cif_scene::build_from(&field.inner, &mut source, options))?;
+    let mut source = CallableMotion { field, function: function.unbind(), error: None };
+    let graph = process::detach(py, || cif_scene::build_from(field, &mut source, options))?;
     match source.error {
         Some(error) => Err(error),
         None => graph.map_err(cif_error),

@@ -6,11 +6,10 @@ use std::sync::OnceLock;
 use cif::lock::Lock;
 use cif::output;
 use cif_field::{Gaussians, RecordedCamera};
-use cif_geometry::PinholeCamera;
 use cif_geometry::scalar::sigmoid;
 use cif_geometry::spherical_harmonics::COEFFICIENTS;
+use cif_render::Channels;
 use cif_render::cpu::{Renderer, SimdLevel};
-use cif_render::{Channels, RenderSettings, RenderedImage};
 use cif_scene::{SceneGraph, SceneOptions};
 use cif_system::memory::Need;
 use glam::DVec3;
@@ -23,7 +22,7 @@ use crate::camera::Camera;
 use crate::error::cif_error;
 use crate::from_arrays::FromArrays;
 use crate::picture::{Picture, View};
-use crate::{arrays, export, objects, picture, process, tables};
+use crate::{arrays, export, objects, picture, process, rendering, tables};
 
 /// A dynamic Gaussian field with instances: N Gaussians, K instances, T captured times.
 ///
@@ -42,45 +41,17 @@ impl Field {
     }
 
     /// The scene graph, without stand-ins and colliders.
-    pub(crate) fn graph(&self, py: Python<'_>) -> PyResult<&SceneGraph> {
+    fn graph(&self, py: Python<'_>) -> PyResult<&SceneGraph> {
         let build = || {
             let options = SceneOptions { proxy_points: 0, hulls_per_instance: 0, ..SceneOptions::default() };
             cif_scene::build(&self.inner, &options).map_err(|error| error.to_string())
         };
         process::detach(py, || self.graph.get_or_init(build))?.as_ref().map_err(cif_error)
     }
-
-    /// A view of the field with all its layers.
-    pub(crate) fn draw(
-        &self,
-        py: Python<'_>,
-        camera: &Camera,
-        time: f64,
-        channels: Channels,
-    ) -> PyResult<RenderedImage> {
-        let settings = RenderSettings::of_field(&self.inner);
-        let instances = channels.instances && self.inner.identities.is_some();
-        let channels = Channels { instances, ..channels };
-        memory_of_view(camera, channels).check().map_err(cif_error)?;
-        process::detach(py, || {
-            Renderer::new(SimdLevel::Auto).render(&self.inner, &camera.inner, time, &settings, channels)
-        })
-    }
-}
-
-/// Memory of the arrays of a view.
-fn memory_of_view(camera: &Camera, channels: Channels) -> Need {
-    // Colour and alpha; depth; label, probability, coverage, foreground and entropy.
-    let values = 4 + u64::from(channels.depth) + 5 * u64::from(channels.instances);
-    let PinholeCamera { width, height, .. } = camera.inner;
-    Need {
-        bytes: 4 * values * u64::from(width) * u64::from(height),
-        arithmetic: format!("{width} x {height} pixels x {values} values x 4 bytes"),
-    }
 }
 
 /// Memory of the probabilities of every instance in each of some rows.
-fn memory_of_rows((rows, name): (usize, &str), instances: usize, item: usize) -> Need {
+fn memory_of_rows(rows: usize, name: &str, instances: usize, item: usize) -> Need {
     let bytes = (rows as u64).saturating_mul(instances as u64).saturating_mul(item as u64);
     Need { bytes, arithmetic: format!("{rows} {name} x {instances} instances x {item} bytes") }
 }
@@ -158,7 +129,7 @@ impl Field {
     /// The first view and the objects as a table, for notebooks.
     fn _repr_html_(&self, py: Python<'_>) -> PyResult<String> {
         // A view that memory does not hold is none to fail for.
-        let view = picture::of_field(py, self, View::Captured(0), None, "rgb");
+        let view = picture::of_field(py, &self.inner, View::Captured(0), None, "rgb");
         let still = view.ok().map(|view| view.as_html(py)).transpose()?.unwrap_or_default();
         Ok(still + &tables::of_field(&self.inner))
     }
@@ -214,7 +185,7 @@ impl Field {
     fn identities<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArray2<f32>>>> {
         let Some(rows) = &self.inner.identities else { return Ok(None) };
         let instances = self.inner.instances.len();
-        memory_of_rows((rows.len(), "Gaussians"), instances, size_of::<f32>()).check().map_err(cif_error)?;
+        memory_of_rows(rows.len(), "Gaussians", instances, size_of::<f32>()).check().map_err(cif_error)?;
         let probabilities = rows.probabilities();
         let mut dense = vec![0.0_f32; rows.len() * instances];
         for row in 0..rows.len() {
@@ -287,7 +258,7 @@ impl Field {
         instances: bool,
     ) -> PyResult<Bound<'py, PyDict>> {
         check_time(time)?;
-        let image = self.draw(py, &camera, time, Channels { depth, instances })?;
+        let image = rendering::render(py, &self.inner, &camera, time, Channels { depth, instances })?;
         let out = PyDict::new(py);
         out.set_item("color", arrays::color_image(py, image.color)?)?;
         out.set_item("alpha", arrays::image(py, image.alpha)?)?;
@@ -312,7 +283,7 @@ impl Field {
     #[pyo3(signature = (view=None, time=None, *, what="rgb"))]
     fn show(&self, py: Python<'_>, view: Option<View>, time: Option<f64>, what: &str) -> PyResult<Picture> {
         time.map_or(Ok(()), check_time)?;
-        picture::of_field(py, self, view.unwrap_or(View::Captured(0)), time, what)
+        picture::of_field(py, &self.inner, view.unwrap_or(View::Captured(0)), time, what)
     }
 
     /// Answer what is at points at a normalised time.
@@ -328,7 +299,7 @@ impl Field {
     ) -> PyResult<Bound<'py, PyDict>> {
         check_time(time)?;
         let (count, instances) = (points.shape().first().copied().unwrap_or(0), self.inner.instances.len());
-        memory_of_rows((count, "points"), instances, size_of::<f64>()).check().map_err(cif_error)?;
+        memory_of_rows(count, "points", instances, size_of::<f64>()).check().map_err(cif_error)?;
         let points: Vec<DVec3> =
             arrays::rows::<f64, 3>("points", &points)?.into_iter().map(DVec3::from_array).collect();
         let answers = process::detach(py, || self.inner.query(&points, time))?;
@@ -361,7 +332,7 @@ impl Field {
         label: String,
         time_code: Option<f64>,
     ) -> PyResult<Bound<'py, PyAny>> {
-        objects::find(py, self, label, time_code)
+        objects::find(py, self.graph(py)?, label, time_code)
     }
 
     /// Return the path of an object over all captured frames, as arrays.
@@ -375,7 +346,7 @@ impl Field {
     /// part, one that bends with the rigid body that fits it best. Raises CifError where no object, or more
     /// than one, carries the label.
     fn trajectory<'py>(&self, py: Python<'py>, label: String) -> PyResult<Bound<'py, PyDict>> {
-        objects::trajectory(py, self, label)
+        objects::trajectory(py, self.graph(py)?, label)
     }
 
     /// Write the scene with one prim or node per object.
@@ -399,7 +370,7 @@ impl Field {
         force: bool,
         scene: Option<Bound<'py, PyDict>>,
     ) -> PyResult<Bound<'py, PyDict>> {
-        export::export(py, self, &path, motion, options.as_ref(), force, scene.as_ref())
+        export::export(py, &self.inner, &path, motion, options.as_ref(), force, scene.as_ref())
     }
 }
 

@@ -9,6 +9,7 @@
 //! | `field` | trained scenes: arrays, rendering, queries |
 //! | `from_arrays` | fields of numpy arrays |
 //! | `objects` | objects by label, and their paths |
+//! | `rendering` | views of fields |
 //! | `picture`, `tables` | what notebooks show |
 //! | `evaluate` | scores on a capture |
 //! | `export` | scenes as files |
@@ -34,6 +35,7 @@ mod import;
 mod objects;
 mod picture;
 mod process;
+mod rendering;
 mod tables;
 mod train;
 

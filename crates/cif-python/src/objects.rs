@@ -3,13 +3,12 @@
 use std::path::PathBuf;
 
 use cif::formats;
-use cif_scene::{LabelQuery, ObjectQuery, ReadOptions, TrajectorySample};
+use cif_scene::{LabelQuery, ObjectQuery, ReadOptions, SceneGraph, TrajectorySample};
 use numpy::PyArray1;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::error::cif_error;
-use crate::field::Field;
 use crate::{arrays, process};
 
 /// Name of a field in errors.
@@ -17,18 +16,22 @@ const PLACE: &str = "the field";
 
 pub(crate) fn find<'py>(
     py: Python<'py>,
-    field: &Field,
+    graph: &SceneGraph,
     label: String,
     time_code: Option<f64>,
 ) -> PyResult<Bound<'py, PyAny>> {
     let query = LabelQuery { pattern: label, time_code };
-    let found = cif_scene::query(field.graph(py)?, &query, PLACE).map_err(cif_error)?;
+    let found = cif_scene::query(graph, &query, PLACE).map_err(cif_error)?;
     arrays::to_python(py, &found)
 }
 
-pub(crate) fn trajectory<'py>(py: Python<'py>, field: &Field, label: String) -> PyResult<Bound<'py, PyDict>> {
+pub(crate) fn trajectory<'py>(
+    py: Python<'py>,
+    graph: &SceneGraph,
+    label: String,
+) -> PyResult<Bound<'py, PyDict>> {
     let wanted = ObjectQuery { label: Some(label.clone()), ..ObjectQuery::default() };
-    let found = cif_scene::trajectories(field.graph(py)?, &wanted, PLACE).map_err(cif_error)?;
+    let found = cif_scene::trajectories(graph, &wanted, PLACE).map_err(cif_error)?;
     let [path] = found.as_slice() else {
         let names: Vec<&str> = found.iter().map(|path| path.instance.as_str()).collect();
         let names = names.join(", ");

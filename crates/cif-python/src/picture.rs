@@ -6,6 +6,8 @@ use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use cif::output::check_file;
 use cif::pictures::{depth_picture, instance_color, instance_picture, png_bytes, rgb_picture, save_rgb};
+use cif_dataset::Dataset;
+use cif_field::Field;
 use cif_render::Channels;
 use cif_train::metrics::mask_ids;
 use numpy::PyArray3;
@@ -14,10 +16,8 @@ use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use crate::camera::Camera;
-use crate::dataset::Dataset;
 use crate::error::cif_error;
-use crate::field::Field;
-use crate::{arrays, process};
+use crate::{arrays, process, rendering};
 
 /// An 8-bit RGB picture, as drawn by `show`; notebooks show it.
 #[pyclass(frozen, module = "cif")]
@@ -85,7 +85,7 @@ pub(crate) fn of_field(
     time: Option<f64>,
     what: &str,
 ) -> PyResult<Picture> {
-    let recorded = &field.inner.cameras;
+    let recorded = &field.cameras;
     let (camera, own) = match view {
         View::Camera(camera) => (camera, 0.0),
         View::Captured(index) => {
@@ -93,16 +93,16 @@ pub(crate) fn of_field(
                 let count = recorded.len();
                 return Err(PyIndexError::new_err(format!("view {index} of {count}; or give a camera")));
             };
-            (Camera { inner: view.camera }, field.inner.timeline.times[view.time_index])
+            (Camera { inner: view.camera }, field.timeline.times[view.time_index])
         }
     };
     let channels = Channels { depth: what == "depth-color", instances: what == "instance-color" };
     if what != "rgb" && !channels.depth && !channels.instances {
         return Err(unknown(what, "rgb, instance-color or depth-color"));
     }
-    let image = field.draw(py, &camera, time.unwrap_or(own), channels)?;
+    let image = rendering::render(py, field, &camera, time.unwrap_or(own), channels)?;
     let inner = match (&image.instances, &image.depth) {
-        (Some(layers), _) => instance_picture(&mask_ids(&field.inner, &layers.label), &layers.foreground),
+        (Some(layers), _) => instance_picture(&mask_ids(field, &layers.label), &layers.foreground),
         (None, Some(depth)) => depth_picture(depth),
         (None, None) if channels.instances => {
             return Err(cif_error("the field has no instances to show: it was made without masks"));
@@ -112,13 +112,13 @@ pub(crate) fn of_field(
     Ok(Picture { inner })
 }
 
-/// A frame of a capture.
+/// A frame of a capture, which has it.
 pub(crate) fn of_frame(py: Python<'_>, dataset: &Dataset, index: usize, what: &str) -> PyResult<Picture> {
-    let name = &dataset.frame_at(index)?.name;
+    let name = &dataset.frames[index].name;
     if !matches!(what, "rgb" | "instance-color") {
         return Err(unknown(what, "rgb or instance-color"));
     }
-    let data = process::detach(py, || dataset.inner.load_frame(index, [1.0; 3]))?.map_err(cif_error)?;
+    let data = process::detach(py, || dataset.load_frame(index, [1.0; 3]))?.map_err(cif_error)?;
     if what == "rgb" {
         return Ok(Picture { inner: data.image });
     }

@@ -17,7 +17,7 @@ const MOST: [(&str, usize); 21] = [
     ("cif-system", 0),
     ("cif-dataset", 0),
     ("cif-field", 0),
-    ("cif-vision", 2),
+    ("cif-vision", 0),
     ("cif-web", 0),
     ("cif-render", 5),
     ("cif-masks", 0),
@@ -29,9 +29,9 @@ const MOST: [(&str, usize); 21] = [
     ("cif-gltf", 0),
     ("cif-ply", 0),
     ("cif-exr", 0),
-    ("cif-bench", 2),
+    ("cif-bench", 0),
     ("cif", 0),
-    ("cif-python", 5),
+    ("cif-python", 0),
 ];
 
 /// A piece of Rust source.

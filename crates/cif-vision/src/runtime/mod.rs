@@ -3,11 +3,15 @@
 #[cfg(not(feature = "onnx"))]
 mod absent;
 #[cfg(feature = "onnx")]
+mod messages;
+#[cfg(feature = "onnx")]
 mod onnx;
 #[cfg(feature = "onnx")]
 mod place;
 #[cfg(feature = "onnx")]
 mod runner;
+#[cfg(feature = "onnx")]
+mod serve;
 #[cfg(feature = "onnx")]
 mod signature;
 #[cfg(feature = "onnx")]
@@ -25,9 +29,9 @@ pub(crate) use absent::{Session, Tokenizer};
 #[cfg(feature = "onnx")]
 pub(crate) use onnx::Session;
 #[cfg(feature = "onnx")]
-pub(crate) use tokens::Tokenizer;
+pub use serve::serve;
 #[cfg(feature = "onnx")]
-pub use worker::serve;
+pub(crate) use tokens::Tokenizer;
 
 type Start = Box<dyn Fn() -> Command + Send + Sync>;
 

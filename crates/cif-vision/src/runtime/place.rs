@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
+use super::messages::{Answer, Question};
 use super::runner::{self, Runner};
 use super::signature::Declared;
-use super::worker::{Answer, Question, Worker};
+use super::worker::Worker;
 use super::{Reading, START};
 use crate::{Error, Tensor};
 

@@ -227,13 +227,13 @@ impl Queries {
 
 /// Marks the largest number of every column among several lines of the same rule. Equal as they are shown is equal.
 fn mark_best(lines: &mut [Line]) {
-    let shown = |cell: &Cell| cell.0.mean.map(|mean| (mean * 10f64.powi(DIGITS as i32)).round());
+    let rounded = |cell: &Cell| cell.0.mean.map(|mean| (mean * 10f64.powi(DIGITS as i32)).round());
     for of_rule in lines.chunk_by_mut(|a, b| a.rule == b.rule).filter(|lines| lines.len() > 1) {
         for column in 0..of_rule[0].cells.len() {
-            let most = of_rule.iter().filter_map(|line| shown(&line.cells[column]));
+            let most = of_rule.iter().filter_map(|line| rounded(&line.cells[column]));
             let most = most.fold(f64::NEG_INFINITY, f64::max);
             for line in &mut *of_rule {
-                line.cells[column].1 = shown(&line.cells[column]) == Some(most);
+                line.cells[column].1 = rounded(&line.cells[column]) == Some(most);
             }
         }
     }
