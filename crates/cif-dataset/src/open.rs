@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use crate::files::points::RawPoints;
 use crate::files::{image, json, listing};
 use crate::formats::{self, Draft, Source, some_of};
-use crate::mask_files::MaskFolder;
+use crate::mask_files::{MaskFolder, MaskListing};
 use crate::orientation::Orientation;
 use crate::sizes::{centred, reduced_size};
 use crate::{
@@ -248,24 +248,10 @@ impl Dataset {
             Some(name) => MaskFolder::asked(&self.root, name),
             None => MaskFolder::of_capture(&self.root, self.layout),
         };
-        let mut listing = mask_files::locate(&self.root, self.layout, &self.frames, &folder);
-        if let Some(name) = asked {
-            self.mask_paths(name)?;
-        } else {
-            let (after_named, left_out) = listing.after_named(&folder, &self.frames);
-            listing = after_named;
-            if left_out > 0 {
-                self.warnings.push(format!(
-                    "{}: not used: the capture names the masks of its frames, and they are not in it ({}); to take \
-                     these, name it as the folder of masks",
-                    folder.path.display(),
-                    listing.place
-                ));
-            }
-        }
+        let mut listing = self.locate_masks(asked, &folder)?;
         if listing.paths.iter().any(Option::is_some) {
             for ((frame, path), confidence) in
-                self.frames.iter_mut().zip(listing.paths).zip(listing.confidences)
+                self.frames.iter_mut().zip(listing.paths.drain(..)).zip(listing.confidences.drain(..))
             {
                 (frame.mask, frame.confidence) = (path, confidence);
             }
@@ -277,19 +263,8 @@ impl Dataset {
                 self.frames[0].name
             ));
         }
-        for frame in &self.frames {
-            if let Some(mask) = frame.mask.as_ref().filter(|mask| !listing::is_there(mask)) {
-                return Err(Error::MissingFile {
-                    path: mask.clone(),
-                    fix: format!(
-                        "it is named as the mask of frame {}; restore it, remove mask_path, or name a folder of masks",
-                        frame.name
-                    ),
-                });
-            }
-        }
-        let masked = self.frames.iter().filter(|frame| frame.mask.is_some()).count();
-        if masked == 0 {
+        self.check_named_masks()?;
+        if self.frames.iter().all(|frame| frame.mask.is_none()) {
             self.warnings.push(format!(
                 "{}: no masks: only colour can be trained; give instance masks in {}/ or name their folder",
                 self.root.display(),
@@ -297,19 +272,8 @@ impl Dataset {
             ));
             return Ok(());
         }
-        let masked_of = |split: Split| {
-            let frames = self.split_frames(split);
-            (frames.iter().filter(|index| self.frames[**index].mask.is_some()).count(), frames.len())
-        };
-        let ((train, all_train), (val, all_val)) = (masked_of(Split::Train), masked_of(Split::Val));
-        let place = listing.place;
-        if train < all_train && !keyframes {
-            self.warnings.push(format!("{place}: {masked} of {} frames have a mask", self.frames.len()));
-        } else if val < all_val && !keyframes {
-            self.notes.push(format!(
-                "{place}: {val} of {all_val} held-out frames have a mask; instances are scored {}",
-                if val == 0 { "on none" } else { "on these" }
-            ));
+        if !keyframes {
+            self.note_frames_without_mask(&listing.place);
         }
         if listing.strangers > 0 {
             unused.push(format!(
@@ -319,18 +283,7 @@ impl Dataset {
             ));
         }
         if listing.numbered {
-            let numbered: Vec<String> = self
-                .frames
-                .iter()
-                .filter_map(|frame| {
-                    let mask = frame.mask.as_ref()?;
-                    Some(format!("{} for {}", mask.file_name()?.to_string_lossy(), frame.name))
-                })
-                .collect();
-            self.notes.push(format!(
-                "{place}: the files belong to frames by their numbers: {}",
-                some_of(numbered.iter().map(String::as_str))
-            ));
+            self.note_numbered_masks(&listing.place);
         }
         let headers = mask_files::check_headers(&self.frames, stored_sizes)?;
         if let Some(resized) = headers.resized {
@@ -344,6 +297,87 @@ impl Dataset {
                 resized.count
             ));
         }
+        self.find_instances(&folder, &listing, headers.largest_id, keyframes)
+    }
+
+    /// The masks of a folder; those that the capture itself names go before, unless the folder was asked for.
+    fn locate_masks(&mut self, asked: Option<&Path>, folder: &MaskFolder) -> Result<MaskListing, Error> {
+        let listing = mask_files::locate(&self.root, self.layout, &self.frames, folder);
+        if let Some(name) = asked {
+            self.mask_paths(name)?;
+            return Ok(listing);
+        }
+        let (listing, left_out) = listing.after_named(folder, &self.frames);
+        if left_out > 0 {
+            self.warnings.push(format!(
+                "{}: not used: the capture names the masks of its frames, and they are not in it ({}); to take \
+                 these, name it as the folder of masks",
+                folder.path.display(),
+                listing.place
+            ));
+        }
+        Ok(listing)
+    }
+
+    /// Refuses masks that the capture names and does not have.
+    fn check_named_masks(&self) -> Result<(), Error> {
+        for frame in &self.frames {
+            if let Some(mask) = frame.mask.as_ref().filter(|mask| !listing::is_there(mask)) {
+                return Err(Error::MissingFile {
+                    path: mask.clone(),
+                    fix: format!(
+                        "it is named as the mask of frame {}; restore it, remove mask_path, or name a folder of masks",
+                        frame.name
+                    ),
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// Tells that training frames, or else held-out ones, have no mask.
+    fn note_frames_without_mask(&mut self, place: &str) {
+        let masked_of = |split: Split| {
+            let frames = self.split_frames(split);
+            (frames.iter().filter(|index| self.frames[**index].mask.is_some()).count(), frames.len())
+        };
+        let ((train, all_train), (val, all_val)) = (masked_of(Split::Train), masked_of(Split::Val));
+        if train < all_train {
+            let masked = self.frames.iter().filter(|frame| frame.mask.is_some()).count();
+            self.warnings.push(format!("{place}: {masked} of {} frames have a mask", self.frames.len()));
+        } else if val < all_val {
+            self.notes.push(format!(
+                "{place}: {val} of {all_val} held-out frames have a mask; instances are scored {}",
+                if val == 0 { "on none" } else { "on these" }
+            ));
+        }
+    }
+
+    /// Tells which masks belong to which frames by their numbers.
+    fn note_numbered_masks(&mut self, place: &str) {
+        let numbered: Vec<String> = self
+            .frames
+            .iter()
+            .filter_map(|frame| {
+                let mask = frame.mask.as_ref()?;
+                Some(format!("{} for {}", mask.file_name()?.to_string_lossy(), frame.name))
+            })
+            .collect();
+        self.notes.push(format!(
+            "{place}: the files belong to frames by their numbers: {}",
+            some_of(numbered.iter().map(String::as_str))
+        ));
+    }
+
+    /// Decodes the masks once and names the instances in them.
+    fn find_instances(
+        &mut self,
+        folder: &MaskFolder,
+        listing: &MaskListing,
+        largest_id: u16,
+        keyframes: bool,
+    ) -> Result<(), Error> {
+        let place = &listing.place;
         let file = instances::file_for(&self.root, listing.folder.as_deref());
         let mut named = match &file {
             Some(file) => instances::read(file, &mut self.warnings)?,
@@ -353,13 +387,8 @@ impl Dataset {
         self.mask_objects = cryptomatte::ObjectIds::new();
         if !manifests.is_empty() {
             let explicit = cryptomatte::explicit(listing.folder.as_deref())?;
-            self.mask_objects = cryptomatte::assign(
-                &manifests,
-                &explicit,
-                &mut named,
-                Path::new(&place),
-                &mut self.warnings,
-            )?;
+            self.mask_objects =
+                cryptomatte::assign(&manifests, &explicit, &mut named, Path::new(place), &mut self.warnings)?;
         }
         let counts = mask_files::count_pixels(&self.frames, &self.mask_objects)?;
         let found: BTreeSet<u16> =
@@ -394,8 +423,7 @@ impl Dataset {
                 self.root.display()
             ));
         }
-        self.instances =
-            instances::complete(&found, headers.largest_id, named, file.as_deref(), &mut self.warnings);
+        self.instances = instances::complete(&found, largest_id, named, file.as_deref(), &mut self.warnings);
         Ok(())
     }
 

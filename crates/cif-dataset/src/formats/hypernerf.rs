@@ -95,52 +95,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let extra_path = root.join("extra.json");
     let frames_per_second =
         if listing::is_there(&extra_path) { json::read::<Extra>(&extra_path)?.fps } else { None };
-    let mut frames = Vec::with_capacity(splits.len());
-    let (mut first_warp, mut last_warp) = (u64::MAX, 0);
-    let mut without_image = Vec::new();
-    for (id, split) in &splits {
-        let entry = metadata.get(id).ok_or_else(|| {
-            Error::invalid(
-                &metadata_path,
-                format!("no entry for frame {id}, which dataset.json lists; add it"),
-            )
-        })?;
-        let warp = entry.warp_id.ok_or_else(|| {
-            Error::invalid(&metadata_path, format!("frame {id} has no warp_id, which gives its time; add it"))
-        })?;
-        (first_warp, last_warp) = (first_warp.min(warp), last_warp.max(warp));
-        let camera_path = root.join("camera").join(format!("{id}.json"));
-        let image = listing::with_image_extension(&images.join(id));
-        let image = match (image, listing::is_there(&camera_path)) {
-            (Some(image), true) => image,
-            (Some(image), false) => return Err(Error::ImageWithoutCamera { image, camera: camera_path }),
-            // Published lists name frames that were taken out of the folder of images again.
-            (None, _) if *split == Split::Train => {
-                without_image.push(id.as_str());
-                continue;
-            }
-            (None, _) => {
-                return Err(Error::CameraWithoutImage {
-                    frame: id.clone(),
-                    source_file: list_path,
-                    image: images.join(format!("{id}.png")),
-                });
-            }
-        };
-        frames.push(DraftFrame {
-            name: id.clone(),
-            camera_name: format!("camera_{}", entry.camera_id),
-            // Shifted and scaled below, once the first and last are known.
-            time: warp as f64,
-            split: *split,
-            image,
-            mask: None,
-            camera: camera(&camera_path, id)?,
-        });
-    }
-    for frame in &mut frames {
-        frame.time = (frame.time - first_warp as f64) / (last_warp - first_warp).max(1) as f64;
-    }
+    let (frames, without_image) = frames(root, &splits, &metadata, &images)?;
     if !without_image.is_empty() {
         warnings.push(format!(
             "{}: {} training frames have no image in {} and are left out: {}",
@@ -167,6 +122,63 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         unused,
         ..Draft::default()
     })
+}
+
+/// Frames with their cameras and times in [0, 1], and the training frames that have no image.
+fn frames<'a>(
+    root: &Path,
+    splits: &'a [(String, Split)],
+    metadata: &BTreeMap<String, Metadata>,
+    images: &Path,
+) -> Result<(Vec<DraftFrame>, Vec<&'a str>), Error> {
+    let metadata_path = root.join("metadata.json");
+    let mut frames = Vec::with_capacity(splits.len());
+    let (mut first_warp, mut last_warp) = (u64::MAX, 0);
+    let mut without_image = Vec::new();
+    for (id, split) in splits {
+        let entry = metadata.get(id).ok_or_else(|| {
+            Error::invalid(
+                &metadata_path,
+                format!("no entry for frame {id}, which dataset.json lists; add it"),
+            )
+        })?;
+        let warp = entry.warp_id.ok_or_else(|| {
+            Error::invalid(&metadata_path, format!("frame {id} has no warp_id, which gives its time; add it"))
+        })?;
+        (first_warp, last_warp) = (first_warp.min(warp), last_warp.max(warp));
+        let camera_path = root.join("camera").join(format!("{id}.json"));
+        let image = listing::with_image_extension(&images.join(id));
+        let image = match (image, listing::is_there(&camera_path)) {
+            (Some(image), true) => image,
+            (Some(image), false) => return Err(Error::ImageWithoutCamera { image, camera: camera_path }),
+            // Published lists name frames that were taken out of the folder of images again.
+            (None, _) if *split == Split::Train => {
+                without_image.push(id.as_str());
+                continue;
+            }
+            (None, _) => {
+                return Err(Error::CameraWithoutImage {
+                    frame: id.clone(),
+                    source_file: root.join("dataset.json"),
+                    image: images.join(format!("{id}.png")),
+                });
+            }
+        };
+        frames.push(DraftFrame {
+            name: id.clone(),
+            camera_name: format!("camera_{}", entry.camera_id),
+            // Shifted and scaled below, once the first and last are known.
+            time: warp as f64,
+            split: *split,
+            image,
+            mask: None,
+            camera: camera(&camera_path, id)?,
+        });
+    }
+    for frame in &mut frames {
+        frame.time = (frame.time - first_warp as f64) / (last_warp - first_warp).max(1) as f64;
+    }
+    Ok((frames, without_image))
 }
 
 /// The ids of a capture, each once.

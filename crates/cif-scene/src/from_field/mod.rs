@@ -7,6 +7,7 @@ mod image;
 pub(crate) mod node;
 
 use std::collections::BTreeSet;
+use std::ops::RangeInclusive;
 
 use cif_field::{Field, Gaussians, RecordedCamera};
 use cif_geometry::quaternion;
@@ -20,7 +21,7 @@ use crate::field_motion::FieldMotion;
 use crate::field_motion::frames::{Frame, Frames};
 use crate::from_field::assignment::{Assignment, Identity};
 use crate::from_field::node::{Naming, NodeInput};
-use crate::graph::{Node, NodeKind, Origin, SceneGraph, TimeCodes};
+use crate::graph::{CameraTrack, Node, NodeKind, Origin, SceneGraph, TimeCodes};
 use crate::motion::choose::{self, Chosen};
 use crate::motion::group::{MovingGroup, trimmed_box};
 use crate::motion::loose::{self, Change};
@@ -78,46 +79,16 @@ pub fn build_from(
     if !follows_tracks {
         assigned.groups.fill(None);
     }
-    // Instances at rest, which something passes over: known once all have been looked at.
-    let mut at_rest = BTreeSet::new();
-    let (group_owners, groups, chosen) = loop {
-        let grouped = rows_of_nodes(field, &visible, &assigned, &at_rest, &mut frames_of, options);
-        let (group_owners, mut groups) = moving_groups(grouped, &reference, &opacities.peak, options);
-        let chosen = motions(field, &mut groups, &mut frames_of, &reference, &time_codes, options);
-        let rest = group_owners
-            .iter()
-            .zip(&groups)
-            .zip(&chosen)
-            .filter(|(_, chosen)| matches!(chosen, Chosen::Static));
-        let passed: Vec<usize> = rest
-            .filter_map(|((owner, group), _)| owner.filter(|_| group.is_passed))
-            .filter(|owner| !at_rest.contains(owner))
-            .collect();
-        if passed.is_empty() || options.most_expensive_motion < MotionModel::Parts {
-            break (group_owners, groups, chosen);
-        }
-        at_rest.extend(passed);
-    };
-
+    let sampled =
+        SampledField { field, reference: &reference, opacities: &opacities, time_codes: &time_codes };
+    let NodeMotions { owners, groups, chosen } =
+        moving_nodes(&sampled, &visible, &assigned, &mut frames_of, options);
     let input = NodeInput { field, reference: &reference, identities: &identities };
-    let mut nodes: Vec<Node> = Vec::with_capacity(groups.len());
-    let mut names = naming::Names::default();
-    for ((owner, group), chosen) in group_owners.iter().zip(&groups).zip(chosen) {
-        let stands = nodes.last().is_none_or(|node| node.kind != NodeKind::Background);
-        let background = if stands { naming::BACKGROUND } else { naming::MOVING_BACKGROUND };
-        let naming = Naming::of(field, *owner, background, &mut names);
-        nodes.push(node::node(&input, naming, group, chosen));
-    }
+    let mut nodes = named_nodes(&input, &owners, &groups, chosen);
     node::measure(&mut nodes, &groups, &mut frames_of, &time_codes.samples);
     // Those of the capture, of which the field may be a window.
     let source_frames = (time_codes.start().max(0.0) as usize, time_codes.end().max(0.0) as usize);
-    let code_of =
-        |index: usize| (frames[0]..=frames[frames.len() - 1]).contains(&index).then(|| codes[index]);
-    let exposure_of = |recorded: &RecordedCamera| {
-        let time = field.timeline.times[recorded.time_index];
-        field.record.drawing.exposure(&recorded.name, time).map_or(0.0, |exposure| exposure.stops())
-    };
-    let cameras = camera_tracks::camera_tracks(&field.cameras, code_of, exposure_of);
+    let cameras = cameras(field, frames[0]..=frames[frames.len() - 1]);
     let antialiased = field.record.drawing.antialiased.unwrap_or_default();
     let blur = options.bake_blur.then(|| Blur::of(&cameras, antialiased)).flatten();
     if options.bake_blur && blur.is_none() {
@@ -126,18 +97,7 @@ pub fn build_from(
     for (node, group) in nodes.iter_mut().zip(&groups) {
         node.source_frames = source_frames;
         node.visibility = visibility::of_rows(field, &node.splats.rows);
-        let thinning = Thinning {
-            time_codes: &time_codes.samples,
-            weights: &node::weights(node, group),
-            tolerance: options.appearance_tolerance,
-            reduce: options.reduce_keys,
-        };
-        if opacities.change {
-            appearance::fade(node, &mut frames_of, options.min_opacity, &thinning);
-        }
-        if frames_of.recolor() {
-            appearance::recolor(node, &mut frames_of, &thinning);
-        }
+        add_changes(&sampled, node, group, &mut frames_of, options);
         if options.proxy_points > 0 {
             node.proxy = Some(proxy::point_proxy(&node.splats, options.proxy_points));
         }
@@ -146,20 +106,9 @@ pub fn build_from(
             blur.bake(node);
         }
     }
-    let omitted: Vec<String> = (0..field.instances.len())
-        .filter(|index| !group_owners.contains(&Some(*index)))
-        .map(|index| field.instances[index].label.clone())
-        .collect();
+    let omitted = omitted(field, &owners);
     if !omitted.is_empty() {
-        let hidden = hidden_rows(field, &identities, &visible);
-        let told: Vec<String> = (0..field.instances.len())
-            .filter(|index| !group_owners.contains(&Some(*index)))
-            .map(|index| match hidden[index] {
-                0 => field.instances[index].label.clone(),
-                count => format!("{} ({count} are too faint to be drawn)", field.instances[index].label),
-            })
-            .collect();
-        warnings.push(format!("{NO_SPLATS}{}", told.join(", ")));
+        warnings.push(without_splats(field, &omitted, &identities, &visible));
     }
     let declared = field.record.declared;
     let unit = options.meters_per_unit.or(declared.map(|of| of.meters_per_unit));
@@ -175,10 +124,58 @@ pub fn build_from(
         sort_metric: field.sort_metric,
         antialiased: field.record.drawing.antialiased,
         near: field.record.drawing.near,
-        omitted,
+        omitted: omitted.into_iter().map(|index| field.instances[index].label.clone()).collect(),
         warnings,
         origin: Origin { field_fingerprint: Some(field.fingerprint()), options: Some(options.clone()) },
     })
+}
+
+/// A field at the sampled times.
+struct SampledField<'a> {
+    field: &'a Field,
+    /// The Gaussians at the first of the times, `[N]`.
+    reference: &'a Gaussians,
+    /// Opacities at all of them.
+    opacities: &'a Opacities,
+    time_codes: &'a TimeCodes,
+}
+
+/// Motion of every node to be, `[nodes]`.
+struct NodeMotions {
+    /// Index of the instance; `None` for the background.
+    owners: Vec<Option<usize>>,
+    /// The Gaussians.
+    groups: Vec<MovingGroup>,
+    /// The motion model that was chosen.
+    chosen: Vec<Chosen>,
+}
+
+/// Groups visible rows into nodes and chooses their motion.
+fn moving_nodes(
+    sampled: &SampledField<'_>,
+    visible: &[u32],
+    assigned: &Assignment,
+    frames: &mut Frames<'_>,
+    options: &SceneOptions,
+) -> NodeMotions {
+    let SampledField { field, reference, opacities, time_codes } = *sampled;
+    // Instances at rest, which something passes over: known once all have been looked at.
+    let mut at_rest = BTreeSet::new();
+    loop {
+        let grouped = rows_of_nodes(field, visible, assigned, &at_rest, frames, options);
+        let (owners, mut groups) = moving_groups(grouped, reference, &opacities.peak, options);
+        let chosen = motions(field, &mut groups, frames, reference, time_codes, options);
+        let rest =
+            owners.iter().zip(&groups).zip(&chosen).filter(|(_, chosen)| matches!(chosen, Chosen::Static));
+        let passed: Vec<usize> = rest
+            .filter_map(|((owner, group), _)| owner.filter(|_| group.is_passed))
+            .filter(|owner| !at_rest.contains(owner))
+            .collect();
+        if passed.is_empty() || options.most_expensive_motion < MotionModel::Parts {
+            return NodeMotions { owners, groups, chosen };
+        }
+        at_rest.extend(passed);
+    }
 }
 
 /// Motion of every group: recorded, or else chosen by what fits.
@@ -198,6 +195,80 @@ fn motions(
     let mut open: Vec<&mut MovingGroup> = open.map(|(group, _)| group).collect();
     let mut fitted = choose::choose(&mut open, frames, &time_codes.samples, options).into_iter();
     recorded.into_iter().filter_map(|recorded| recorded.or_else(|| fitted.next())).collect()
+}
+
+/// Nodes with their names: the first of the background is what stands still.
+fn named_nodes(
+    input: &NodeInput<'_>,
+    owners: &[Option<usize>],
+    groups: &[MovingGroup],
+    chosen: Vec<Chosen>,
+) -> Vec<Node> {
+    let mut nodes: Vec<Node> = Vec::with_capacity(groups.len());
+    let mut names = naming::Names::default();
+    for ((owner, group), chosen) in owners.iter().zip(groups).zip(chosen) {
+        let stands = nodes.last().is_none_or(|node| node.kind != NodeKind::Background);
+        let background = if stands { naming::BACKGROUND } else { naming::MOVING_BACKGROUND };
+        let naming = Naming::of(input.field, *owner, background, &mut names);
+        nodes.push(node::node(input, naming, group, chosen));
+    }
+    nodes
+}
+
+/// Recorded cameras at the captured frames of a range.
+fn cameras(field: &Field, frames: RangeInclusive<usize>) -> Vec<CameraTrack> {
+    let codes = field.time_codes();
+    let code_of = |index: usize| frames.contains(&index).then(|| codes[index]);
+    let exposure_of = |recorded: &RecordedCamera| {
+        let time = field.timeline.times[recorded.time_index];
+        field.record.drawing.exposure(&recorded.name, time).map_or(0.0, |exposure| exposure.stops())
+    };
+    camera_tracks::camera_tracks(&field.cameras, code_of, exposure_of)
+}
+
+/// Opacities and colours over time, where they change.
+fn add_changes(
+    sampled: &SampledField<'_>,
+    node: &mut Node,
+    group: &MovingGroup,
+    frames: &mut Frames<'_>,
+    options: &SceneOptions,
+) {
+    let thinning = Thinning {
+        time_codes: &sampled.time_codes.samples,
+        weights: &node::weights(node, group),
+        tolerance: options.appearance_tolerance,
+        reduce: options.reduce_keys,
+    };
+    if sampled.opacities.change {
+        appearance::fade(node, frames, options.min_opacity, &thinning);
+    }
+    if frames.recolor() {
+        appearance::recolor(node, frames, &thinning);
+    }
+}
+
+/// Instances without node, by index.
+fn omitted(field: &Field, owners: &[Option<usize>]) -> Vec<usize> {
+    (0..field.instances.len()).filter(|index| !owners.contains(&Some(*index))).collect()
+}
+
+/// The warning that names instances without splats.
+fn without_splats(
+    field: &Field,
+    omitted: &[usize],
+    identities: &[Option<Identity>],
+    visible: &[u32],
+) -> String {
+    let hidden = hidden_rows(field, identities, visible);
+    let told: Vec<String> = omitted
+        .iter()
+        .map(|index| match hidden[*index] {
+            0 => field.instances[*index].label.clone(),
+            count => format!("{} ({count} are too faint to be drawn)", field.instances[*index].label),
+        })
+        .collect();
+    format!("{NO_SPLATS}{}", told.join(", "))
 }
 
 /// Per instance, how many Gaussians are most probably its own and cannot be drawn.

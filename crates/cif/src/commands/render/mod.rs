@@ -185,23 +185,7 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     let field = scene::load(&command.scene)?;
     let place = command.scene.display().to_string();
     let time_of_all = command.time.map(|moment| scene::time(&field, &place, "--time", moment)).transpose()?;
-    let mut what: BTreeSet<What> = command.what.iter().copied().collect();
-    if what.is_empty() && !command.exr {
-        what.insert(What::Rgb);
-    }
-    let wanted = what.iter().any(|what| what.of_instances());
-    if (wanted || what.contains(&What::Tracks)) && field.identities.is_none() {
-        return Err(Error::failed(
-            format!("{} was trained without masks, so it has no instances to show", command.scene.display()),
-            "leave tracks, instance, foreground, coverage, probability and entropy out of --what, or train with masks",
-        ));
-    }
-    if command.exr && command.quality == QualityName::Draft {
-        return Err(Error::usage(
-            "--exr writes what compositors measure in, which a draft is not",
-            "leave --quality draft or --exr away",
-        ));
-    }
+    let what = wanted_layers(command, &field)?;
     check_look(command, &field)?;
     let mut outputs = Outputs::new(command.force);
     outputs.reads(&command.scene)?;
@@ -218,18 +202,11 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     if is_film {
         outputs.file(&command.output)?;
     } else {
-        output::check_folder(folder, command.force)?;
-        for Shot { view, .. } in &views {
-            for what in &what {
-                outputs.picture(&folder.join(what.folder()), &view.name, "png")?;
-            }
-            if command.exr {
-                outputs.picture(&folder.join(EXR_FOLDER), &view.name, "exr")?;
-            }
-        }
+        check_pictures(command, &mut outputs, &views, &what)?;
     }
     let depth = command.exr || what.contains(&What::Depth) || what.contains(&What::DepthColor);
-    let instances = wanted || (command.exr && field.identities.is_some());
+    let of_instances = what.iter().any(|what| what.of_instances());
+    let instances = of_instances || (command.exr && field.identities.is_some());
     let settings = scene::render_settings(&field);
     let quality = match command.quality {
         QualityName::Draft => quality::DRAFT,
@@ -251,38 +228,12 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     }
     let clock = SystemClock::start();
     let start = clock.now();
-    for (index, Shot { view, camera }) in views.iter().enumerate() {
-        let time = time_of_all.or(view.time).unwrap_or(0.0);
-        let is_recorded = command.look == Look::Recorded;
-        let exposure = is_recorded.then(|| field.record.drawing.exposure(camera, time)).flatten();
-        let recorded = |mut image: RenderedImage| {
-            if let Some(exposure) = exposure {
-                exposure.apply(&mut image.color);
-            }
-            image
-        };
-        let lines = trajectories.as_ref().map(|paths| paths.lines(&view.camera, time)).unwrap_or_default();
+    for (index, Shot { view, .. }) in views.iter().enumerate() {
+        let place = Place { field: &field, views: &views, index, time: time_of_all };
+        let paths = trajectories.as_ref();
+        let lines = paths.map(|paths| paths.lines(&view.camera, place.time_of(view))).unwrap_or_default();
         let mut files = ViewFiles::create(&what, &field, folder, view, lines)?;
-        match &mut painter {
-            Painter::Cpu(renderer) if command.exr => {
-                let place = Place { field: &field, views: &views, index, time: time_of_all };
-                write_exr(renderer, channels, &settings, &place, command, &mut files)?;
-            }
-            Painter::Cpu(renderer) => {
-                let request = BandRequest { channels, ..BandRequest::default() };
-                renderer.render_bands(&field, &view.camera, time, &settings, &request, |band| {
-                    interrupt::go_on()?;
-                    files.add(&recorded(band.image))
-                })?;
-            }
-            #[cfg(feature = "wgpu")]
-            Painter::Gpu(renderer) => {
-                renderer.render_bands(&field, &view.camera, time, &settings, channels, |_, band| {
-                    interrupt::go_on()?;
-                    files.add(&recorded(band))
-                })?;
-            }
-        }
+        write_view(&mut painter, channels, &settings, &place, command, &mut files)?;
         files.finish()?;
         if let (Some(film), Some(what)) = (&mut film, what.first()) {
             let picture = output::inside(&folder.join(what.folder()), &view.name, "png")?;
@@ -302,6 +253,48 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     };
     let report = report(&layers, &views, time_of_all, command, seconds)?;
     command.report.give(|| report, || {})
+}
+
+/// The layers that are asked for, which the scene has.
+fn wanted_layers(command: &Render, field: &Field) -> Result<BTreeSet<What>, Error> {
+    let mut what: BTreeSet<What> = command.what.iter().copied().collect();
+    if what.is_empty() && !command.exr {
+        what.insert(What::Rgb);
+    }
+    let of_instances = what.iter().any(|what| what.of_instances() || *what == What::Tracks);
+    if of_instances && field.identities.is_none() {
+        return Err(Error::failed(
+            format!("{} was trained without masks, so it has no instances to show", command.scene.display()),
+            "leave tracks, instance, foreground, coverage, probability and entropy out of --what, or train with masks",
+        ));
+    }
+    if command.exr && command.quality == QualityName::Draft {
+        return Err(Error::usage(
+            "--exr writes what compositors measure in, which a draft is not",
+            "leave --quality draft or --exr away",
+        ));
+    }
+    Ok(what)
+}
+
+/// Checks the files of all views.
+fn check_pictures(
+    command: &Render,
+    outputs: &mut Outputs,
+    views: &[Shot],
+    what: &BTreeSet<What>,
+) -> Result<(), Error> {
+    let folder = &command.output;
+    output::check_folder(folder, command.force)?;
+    for Shot { view, .. } in views {
+        for what in what {
+            outputs.picture(&folder.join(what.folder()), &view.name, "png")?;
+        }
+        if command.exr {
+            outputs.picture(&folder.join(EXR_FOLDER), &view.name, "exr")?;
+        }
+    }
+    Ok(())
 }
 
 /// Refuses a recorded look that nothing is known of, or that files for compositors do not have.
@@ -593,6 +586,46 @@ impl Place<'_> {
 
     fn time_of(&self, view: &View) -> f64 {
         self.time.or(view.time).unwrap_or(0.0)
+    }
+}
+
+/// Renders a view into its files.
+fn write_view(
+    painter: &mut Painter,
+    channels: Channels,
+    settings: &RenderSettings,
+    place: &Place<'_>,
+    command: &Render,
+    files: &mut ViewFiles<'_>,
+) -> Result<(), Error> {
+    let (field, Shot { view, camera }) = (place.field, &place.views[place.index]);
+    let time = place.time_of(view);
+    let is_recorded = command.look == Look::Recorded;
+    let exposure = is_recorded.then(|| field.record.drawing.exposure(camera, time)).flatten();
+    let recorded = |mut image: RenderedImage| {
+        if let Some(exposure) = exposure {
+            exposure.apply(&mut image.color);
+        }
+        image
+    };
+    match painter {
+        Painter::Cpu(renderer) if command.exr => {
+            write_exr(renderer, channels, settings, place, command, files)
+        }
+        Painter::Cpu(renderer) => {
+            let request = BandRequest { channels, ..BandRequest::default() };
+            renderer.render_bands(field, &view.camera, time, settings, &request, |band| {
+                interrupt::go_on()?;
+                files.add(&recorded(band.image))
+            })
+        }
+        #[cfg(feature = "wgpu")]
+        Painter::Gpu(renderer) => {
+            renderer.render_bands(field, &view.camera, time, settings, channels, |_, band| {
+                interrupt::go_on()?;
+                files.add(&recorded(band))
+            })
+        }
     }
 }
 

@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use cif_dataset::{Dataset, Layout};
 use cif_field::Checkpoint;
+use cif_train::metrics::training_config;
 use cif_train::plan::Basis;
 use cif_train::{
     Control, EffectChoice, EffectPlan, Outcome, Phase, Phases, Preset, Start, Stop, TrainConfig, TrainError,
@@ -220,100 +221,46 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
         command.resume || (command.resume_if_begun && crate::destination::is_unfinished(&command.output));
     let existing = if command.force || resumes { Existing::Replace } else { Existing::Keep };
     let mut destination = Destination::open(&command.output, existing)?;
-    let mut checkpoint = resumes.then(|| load_state(&command.output)).transpose()?;
+    let mut state = resumes.then(|| load_state(&command.output)).transpose()?;
     if command.accept_changes {
-        checkpoint.iter_mut().for_each(cif_train::accept_changes);
+        state.iter_mut().for_each(cif_train::accept_changes);
     }
     if resumes {
         interrupt::set_last_words("interrupted; the saved state is as it was");
     }
     let progress = Arc::new(Mutex::new(Progress::new(command.quiet)));
     let watch = command.view.map(|opening| Watch::start(&command.output, opening)).transpose()?;
-    let stop = Stop::when({
-        let watch = watch.clone();
-        move || interrupt::requested() || watch.as_ref().is_some_and(|watch| watch.is_stopped())
-    });
-    let phases = timing.phases(stop).reported_to({
-        let (progress, watch) = (Arc::clone(&progress), watch.clone());
-        move |event| {
-            shown(&progress).event(event);
-            if let Some(watch) = &watch {
-                watch.phase(event);
-            }
-            Control::Continue
-        }
-    });
+    let phases = phases(&timing, &progress, watch.as_ref());
     let _run = phases.enter(Phase::Other, 0);
     let mut source = command.from.as_deref().map(load_source).transpose()?;
     if command.accept_changes {
         source.iter_mut().for_each(cif_train::accept_changes);
     }
-    let base = source.as_ref().and_then(|source| cif_train::metrics::training_config(&source.field));
-    let layout = command.capture_options.layout_after(&command.capture, |layout| match checkpoint {
-        Some(_) => Ok(()),
-        None => resolve(command, base.as_ref(), layout, None).map(drop),
+    let origin = match (state, source) {
+        (Some(state), _) => Origin::State(state),
+        (None, Some(scene)) => Origin::Scene(scene),
+        (None, None) => Origin::Capture,
+    };
+    let base = origin.settings();
+    let layout = command.capture_options.layout_after(&command.capture, |layout| match origin {
+        Origin::State(_) => Ok(()),
+        _ => resolve(command, base.as_ref(), layout, None).map(drop),
     })?;
 
     #[cfg(feature = "wgpu")]
     let gpu = command.backend.open()?;
 
-    let mut capture = match checkpoint.as_ref().or(source.as_ref()) {
-        Some(begun) => command.capture_options.as_trained(&begun.field),
-        None => command.capture_options.clone(),
-    };
-    if checkpoint.is_none() {
-        let wanted = resolve(command, base.as_ref(), layout, None)?.downscale;
-        capture.downscale = command.capture_options.downscale.or(wanted);
-    }
-    let phase = phases.enter(Phase::Open, 0);
-    let mut dataset = capture.open(&command.capture)?;
-    drop(phase);
-    // A scene that is begun with has its Gaussians; a run that goes on has the points that it began with.
-    let is_wanted = match (&checkpoint, &source) {
-        (Some(checkpoint), _) => cif_train::metrics::training_config(&checkpoint.field),
-        (None, Some(_)) => None,
-        (None, None) => Some(resolve(command, None, layout, None)?),
-    }
-    .is_some_and(|config| config.model.triangulate);
-    let is_found = !is_wanted || starting_points::find(&mut dataset, &phases)?;
-    print_warnings(&dataset);
-
-    let mut trainer = match checkpoint {
-        Some(checkpoint) => Trainer::resume(Start { dataset, phases: phases.clone() }, checkpoint)
+    let (dataset, has_points) = open_capture(command, &origin, layout, &phases)?;
+    let mut trainer = match origin {
+        Origin::State(state) => Trainer::resume(Start { dataset, phases: phases.clone() }, state)
             .map_err(|error| error.of_scene(&command.output))
+            .map_err(|error| not_started(command, error))
             .inspect(|trainer| destination.resumes(trainer.config())),
-        None => {
-            let plan = match &source {
-                Some(_) => None,
-                None => Some(plan(command, &dataset, &phases)?),
-            };
-            let mut config = resolve(command, base.as_ref(), dataset.layout, plan.as_ref())?;
-            command.goals.prepare(&mut config);
-            config.model.triangulate &= is_found;
-            if source.is_none() {
-                let preset = TrainConfig::preset(config.preset, dataset.layout);
-                let (goals, options) = (&command.goals, &command.capture_options);
-                let quiet = command.quiet;
-                dataset = goals.fit(&mut timing, &mut config, &preset, dataset, options, &phases, quiet)?;
-            }
-            destination.check_settings(&config)?;
+        origin => {
             let start = Start { dataset, phases: phases.clone() };
-            let trainer = match (source, &command.from) {
-                (Some(source), Some(path)) => {
-                    let name = path.file_name().unwrap_or_default().to_string_lossy();
-                    Trainer::from_scene(start, config, source, &name).map_err(|error| error.of_scene(path))
-                }
-                _ => Trainer::new(start, config),
-            };
-            trainer.map(|mut trainer| {
-                if let Some(plan) = &plan {
-                    trainer.record_effects(serde_json::json!(plan));
-                }
-                trainer
-            })
+            begin(command, origin, start, has_points, &mut timing, &mut destination)
         }
-    }
-    .map_err(|error| not_started(command, error))?;
+    }?;
     trainer.set_simd(command.simd.into());
     trainer.set_debug_validation(command.debug_validation);
     command.goals.apply(&timing, &mut trainer)?;
@@ -325,6 +272,109 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
 
     shown(&progress).log_to(command.log.as_deref(), resumes)?;
     train(command, &timing, trainer, &mut destination, &progress, watch.as_deref())
+}
+
+/// State that a run starts from.
+enum Origin {
+    /// An unfinished run, which goes on.
+    State(Checkpoint),
+    /// Another scene: its Gaussians, and its settings where no others are given.
+    Scene(Checkpoint),
+    /// The points of the capture.
+    Capture,
+}
+
+impl Origin {
+    /// Settings of the scene.
+    fn settings(&self) -> Option<TrainConfig> {
+        match self {
+            Self::Scene(scene) => training_config(&scene.field),
+            Self::State(_) | Self::Capture => None,
+        }
+    }
+}
+
+/// Phases of a command, which end when the user asks for it, and are shown as they go.
+fn phases(timing: &Timing, progress: &Arc<Mutex<Progress>>, watch: Option<&Arc<Watch>>) -> Phases {
+    let stop = Stop::when({
+        let watch = watch.cloned();
+        move || interrupt::requested() || watch.as_ref().is_some_and(|watch| watch.is_stopped())
+    });
+    let (progress, watch) = (Arc::clone(progress), watch.cloned());
+    timing.phases(stop).reported_to(move |event| {
+        shown(&progress).event(event);
+        if let Some(watch) = &watch {
+            watch.phase(event);
+        }
+        Control::Continue
+    })
+}
+
+/// Opens the capture as its scene was trained, and triangulates points where they are wanted; the second is false where
+/// none were found.
+fn open_capture(
+    command: &Train,
+    origin: &Origin,
+    layout: Layout,
+    phases: &Phases,
+) -> Result<(Dataset, bool), Error> {
+    let mut capture = match origin {
+        Origin::State(begun) | Origin::Scene(begun) => command.capture_options.as_trained(&begun.field),
+        Origin::Capture => command.capture_options.clone(),
+    };
+    if !matches!(origin, Origin::State(_)) {
+        let wanted = resolve(command, origin.settings().as_ref(), layout, None)?.downscale;
+        capture.downscale = command.capture_options.downscale.or(wanted);
+    }
+    let phase = phases.enter(Phase::Open, 0);
+    let mut dataset = capture.open(&command.capture)?;
+    drop(phase);
+    // A scene that is begun with has its Gaussians; a run that goes on has the points that it began with.
+    let is_wanted = match origin {
+        Origin::State(state) => training_config(&state.field),
+        Origin::Scene(_) => None,
+        Origin::Capture => Some(resolve(command, None, layout, None)?),
+    }
+    .is_some_and(|config| config.model.triangulate);
+    let has_points = !is_wanted || starting_points::find(&mut dataset, phases)?;
+    print_warnings(&dataset);
+    Ok((dataset, has_points))
+}
+
+/// A trainer at its first step; `has_points` is false where points were wanted and could not be triangulated.
+fn begin(
+    command: &Train,
+    origin: Origin,
+    start: Start,
+    has_points: bool,
+    timing: &mut Timing,
+    destination: &mut Destination,
+) -> Result<Trainer, Error> {
+    let Start { mut dataset, phases } = start;
+    let is_afresh = matches!(origin, Origin::Capture);
+    let plan = is_afresh.then(|| plan(command, &dataset, &phases)).transpose()?;
+    let mut config = resolve(command, origin.settings().as_ref(), dataset.layout, plan.as_ref())?;
+    command.goals.prepare(&mut config);
+    config.model.triangulate &= has_points;
+    if is_afresh {
+        let preset = TrainConfig::preset(config.preset, dataset.layout);
+        let (goals, options) = (&command.goals, &command.capture_options);
+        dataset = goals.fit(timing, &mut config, &preset, dataset, options, &phases, command.quiet)?;
+    }
+    destination.check_settings(&config)?;
+    let start = Start { dataset, phases };
+    let trainer = match (origin, &command.from) {
+        (Origin::Scene(scene), Some(path)) => {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            Trainer::from_scene(start, config, scene, &name).map_err(|error| error.of_scene(path))
+        }
+        _ => Trainer::new(start, config),
+    };
+    let mut trainer = trainer.map_err(|error| not_started(command, error))?;
+    if let Some(plan) = &plan {
+        trainer.record_effects(serde_json::json!(plan));
+    }
+    Ok(trainer)
 }
 
 /// Runs a trainer to its end, or until it is stopped, and reports the result.
