@@ -86,9 +86,9 @@ pub fn expand(plan: &Plan, benches: &dyn Benches) -> Result<Batch, Error> {
             Each::Run => {
                 runs.iter().enumerate().map(|(k, run)| Subject::of_run(plan, &captures, k, run)).collect()
             }
-            Each::Whole => (0..wholes.len())
-                .map(|k| Subject::of_whole(plan, &captures, (k, &wholes[k]), &runs))
-                .collect(),
+            Each::Whole => {
+                (0..wholes.len()).map(|k| Subject::of_whole(plan, &captures, k, &wholes[k], &runs)).collect()
+            }
             Each::Capture => captures
                 .iter()
                 .enumerate()
@@ -272,7 +272,7 @@ impl<'a> Subject<'a> {
         Self { name, run, whole: run.map(|(_, run)| run.whole), scenes: vec![scene], ..subject }
     }
 
-    fn of_whole(plan: &Plan, captures: &'a [Capture], (index, whole): (usize, &Whole), runs: &[Run]) -> Self {
+    fn of_whole(plan: &Plan, captures: &'a [Capture], index: usize, whole: &Whole, runs: &[Run]) -> Self {
         let mut subject = Self::of_capture(plan, whole.capture, &captures[whole.capture]);
         subject.scenes = runs[whole.runs.clone()].iter().map(|run| scene_of(plan, &run.name)).collect();
         if let [scene] = subject.scenes.as_slice() {

@@ -136,7 +136,7 @@ impl<'a> Author<'a> {
                         joint: part.joint,
                         range: motion.joint_range(position),
                     };
-                    let child = self.part((index, &name), (&node.splats, part.splats.clone()), first, extras);
+                    let child = self.part(index, &name, &node.splats, part.splats.clone(), first, extras);
                     self.pose_channels(child, &part.track, &node.name, error)?;
                 }
             }
@@ -151,7 +151,7 @@ impl<'a> Author<'a> {
                         joint: None,
                         range: None,
                     };
-                    let child = self.part((index, &name), (own, splat..splat + 1), &track[0], extras);
+                    let child = self.part(index, &name, own, splat..splat + 1, &track[0], extras);
                     self.pose_channels(child, &track, &node.name, error)?;
                     self.size_channel(child, &track, sizes, &node.name)?;
                 }
@@ -162,11 +162,13 @@ impl<'a> Author<'a> {
         Ok(index)
     }
 
-    /// A node below that of an object, with a range of splats.
+    /// A node below that of the object `of`, with a range of splats.
     fn part(
         &mut self,
-        (parent, of): (usize, &str),
-        (splats, range): (&'a Splats, Range<usize>),
+        parent: usize,
+        of: &str,
+        splats: &'a Splats,
+        range: Range<usize>,
         first: &PoseSample,
         extras: extras::Part,
     ) -> usize {

@@ -68,7 +68,7 @@ pub(crate) fn relabel(
                 output.display()
             )));
         }
-        let (prims, known) = find(pxr, (&stage, instances), object).map_err(python)?;
+        let (prims, known) = find(pxr, &stage, instances, object).map_err(python)?;
         let [prim] = prims.as_slice() else {
             return Err(refused(match prims.len() {
                 0 => {
@@ -97,7 +97,8 @@ fn has_references(layer: &Bound<'_, PyAny>) -> PyResult<bool> {
 /// The prims that an object is, by mask value, unique name or path; and what could be meant.
 fn find<'py>(
     pxr: &Pxr<'py>,
-    (stage, instances): (&Bound<'py, PyAny>, Instances),
+    stage: &Bound<'py, PyAny>,
+    instances: Instances,
     object: &str,
 ) -> PyResult<(Vec<Bound<'py, PyAny>>, Vec<String>)> {
     let (mut found, mut known) = (Vec::new(), Vec::new());

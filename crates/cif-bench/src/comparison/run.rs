@@ -33,6 +33,15 @@ pub struct Subject<'a> {
     pub config: &'a TrainConfig,
 }
 
+/// A head that is trained on a reconstruction.
+#[derive(Clone, Copy)]
+pub struct HeadRun<'a> {
+    /// Names of its files begin with it.
+    pub id: &'a str,
+    /// Settings, among them the head.
+    pub config: &'a TrainConfig,
+}
+
 /// Settings of the run of a head on a reconstruction: `steps` of the instance stage, with learning rates placed as
 /// the reconstruction has them.
 #[must_use]
@@ -102,11 +111,13 @@ impl Subject<'_> {
     pub fn train(
         &self,
         runs: &Records<Record>,
-        (id, config): (&str, &TrainConfig),
+        head: &HeadRun<'_>,
         reconstruction: &Checkpoint,
         stop: &Stop,
-        (progress, draw): (&mut dyn FnMut(u64, u64), Draw<'_>),
+        progress: &mut dyn FnMut(u64, u64),
+        draw: Draw<'_>,
     ) -> Result<Option<Record>, Error> {
+        let HeadRun { id, config } = *head;
         let run = Run {
             partial: &runs.file(&format!("{id}.partial.cif")),
             dataset: self.dataset,

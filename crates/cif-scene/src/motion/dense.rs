@@ -83,8 +83,8 @@ pub(crate) fn reduce(
     let searched = if all.len() <= SEARCHED { all.clone() } else { systematic(&all, weights, SEARCHED) };
     let fits = |first: usize, last: usize, splats: &[u32]| {
         (first + 1..last).all(|inner| {
-            let ends = (&samples[first], &samples[last]);
-            error(ends, &samples[inner], splats, weights, trim, tolerance) <= tolerance
+            let (a, b) = (&samples[first], &samples[last]);
+            error(a, b, &samples[inner], splats, weights, trim, tolerance) <= tolerance
         })
     };
     let mut kept = keys::kept(samples.len(), |first, last| fits(first, last, &searched));
@@ -108,10 +108,11 @@ pub(crate) fn reduce(
         .collect()
 }
 
-/// Trimmed RMS distance between a sample and the interpolation of two others; what is certainly inside the
+/// Trimmed RMS distance between a sample and the interpolation of two others, `a` before and `b` after it; what is certainly inside the
 /// tolerance is not trimmed.
 fn error(
-    (a, b): (&DenseSample, &DenseSample),
+    a: &DenseSample,
+    b: &DenseSample,
     sample: &DenseSample,
     splats: &[u32],
     weights: &[f64],

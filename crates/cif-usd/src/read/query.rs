@@ -22,7 +22,7 @@ pub(crate) fn query(
     let matcher = query.matcher();
     pxr::with(|pxr| {
         let (stage, instances) = open_for_labels(pxr, path, options)?;
-        let (found, known) = search(pxr, (&stage, instances), query, &matcher)
+        let (found, known) = search(pxr, &stage, instances, query, &matcher)
             .map_err(|error| UsdError::Unusable { path: path.to_owned(), reason: reason(pxr.py, &error) })?;
         if found.is_empty() {
             return Err(query.unknown(&path.display().to_string(), known).into());
@@ -34,7 +34,8 @@ pub(crate) fn query(
 /// Matching prims, and all labels of the stage.
 fn search<'py>(
     pxr: &Pxr<'py>,
-    (stage, instances): (&Bound<'py, PyAny>, Instances),
+    stage: &Bound<'py, PyAny>,
+    instances: Instances,
     query: &LabelQuery,
     matcher: &LabelPattern,
 ) -> PyResult<(Vec<LabelMatch>, Vec<String>)> {

@@ -184,7 +184,7 @@ fn find(
     }
     let black = left_out(command, &solved, masks, places.scratch, hooks)?;
     let work = work_folder(places)?;
-    let request = request(command, &solved, black.as_deref(), fixed, (&work, places.kept));
+    let request = request(command, &solved, black.as_deref(), fixed, &work, places.kept);
     let Found { mut poses, verdict, setting, tried } =
         structure::find(&request, hooks).inspect_err(seen_still)?;
     notes.extend(tried.into_iter().map(|tried| format!("not believed: {tried}")));
@@ -222,7 +222,7 @@ fn points(
     let fixed = is_fixed(command, shots);
     let black = left_out(command, shots, masks, places.scratch, hooks)?;
     let work = work_folder(places)?;
-    let request = request(command, shots, black.as_deref(), fixed, (&work, places.kept));
+    let request = request(command, shots, black.as_deref(), fixed, &work, places.kept);
     let find = if fixed { structure::points_of_rig } else { structure::points_of_images };
     let problem = match find(&request, poses, hooks) {
         Ok(points) if !points.is_empty() => return Ok(points),
@@ -267,7 +267,8 @@ fn request<'a>(
     shots: &'a [Shot],
     masks: Option<&'a Path>,
     fixed: bool,
-    (work, kept): (&'a Path, &'a Path),
+    work: &'a Path,
+    kept: &'a Path,
 ) -> Request<'a> {
     Request {
         shots,

@@ -150,7 +150,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     };
     let graph = cif_scene::build(&field, &options_of(&field)).map_err(Error::plain)?;
     let options = options_of(&field);
-    let (graph, seams) = windows::with_further((&field, graph), &command.targets.windows, options_of)?;
+    let (graph, seams) = windows::with_further(&field, graph, &command.targets.windows, options_of)?;
     for warning in &graph.warnings {
         crate::messages::warning!("{warning}");
     }

@@ -52,7 +52,8 @@ pub(super) fn refuse(
 
 /// Joins the graph of a field and those of further windows; the graph as it is where there are none.
 pub(super) fn with_further(
-    (first, graph): (&Field, SceneGraph),
+    first: &Field,
+    graph: SceneGraph,
     further: &[PathBuf],
     options: impl Fn(&Field) -> SceneOptions,
 ) -> Result<(SceneGraph, Vec<Seam>), Error> {

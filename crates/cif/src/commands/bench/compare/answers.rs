@@ -40,7 +40,8 @@ pub(super) fn ask(
     captures: &[Capture],
     questions: &[OfOneCapture],
     heads: &[HeadName],
-    (folder, models): (&Path, Option<&Path>),
+    folder: &Path,
+    models: Option<&Path>,
 ) -> Result<Queries, Error> {
     let kept: Records<Answers> = Records::inside(folder)?;
     let mut queries = Queries {

@@ -77,8 +77,8 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
     let mut bench = Bench::new(runs, command.iterations, command.budget, maps);
     bench.compare_all(&captures, command.seeds, &contenders)?;
     let heads: Vec<HeadName> = contenders.iter().filter_map(Contender::whole).collect();
-    let of_run = (&*command.output, command.models.as_deref());
-    let ask = |questions: &Vec<_>| answers::ask(&mut bench, &captures, questions, &heads, of_run);
+    let (folder, models) = (&*command.output, command.models.as_deref());
+    let ask = |questions: &Vec<_>| answers::ask(&mut bench, &captures, questions, &heads, folder, models);
     let queries = questions.as_ref().map(ask).transpose()?;
     let videos = match command.video && bench.ended != Some(Ended::Interrupted) {
         true => video::write_all(&command.output, &bench, &captures)?,

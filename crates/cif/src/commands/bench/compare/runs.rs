@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use cif_bench::comparison::Contender;
 use cif_bench::comparison::record::Record;
-use cif_bench::comparison::run::{Subject, settings};
+use cif_bench::comparison::run::{HeadRun, Subject, settings};
 use cif_bench::comparison::tables::Missing;
 use cif_bench::records::{Kept, Records};
 use cif_dataset::MadeFrom;
@@ -135,8 +135,8 @@ impl Bench {
                 Some(base) => {
                     let progress: &mut dyn FnMut(u64, u64) =
                         &mut |done, whole| self.show_share(&heading, contender.name(), done, whole);
-                    let trained =
-                        subject.train(&self.runs, (&id, &config), base, &stop, (progress, &draw))?;
+                    let head = HeadRun { id: &id, config: &config };
+                    let trained = subject.train(&self.runs, &head, base, &stop, progress, &draw)?;
                     if trained.is_none() {
                         self.ended = Some(Ended::Interrupted);
                     }

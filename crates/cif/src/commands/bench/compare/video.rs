@@ -122,7 +122,7 @@ fn path(dataset: &Dataset) -> Vec<(PinholeCamera, f64)> {
 }
 
 /// One picture: colours of the first run, then the labels of every one.
-fn picture(renderer: &mut Renderer, shown: &[Shown], (camera, time): (&PinholeCamera, f64)) -> Picture {
+fn picture(renderer: &mut Renderer, shown: &[Shown], camera: &PinholeCamera, time: f64) -> Picture {
     let mut parts = Vec::new();
     for Shown { field, decoder, settings } in shown {
         let channels =
@@ -171,7 +171,7 @@ fn encode(
             camera.width.min(PART_WIDTH),
             (camera.height * camera.width.min(PART_WIDTH)).div_ceil(camera.width.max(1)),
         );
-        let picture = picture(&mut renderer, shown, (&camera, *time));
+        let picture = picture(&mut renderer, shown, &camera, *time);
         let child = match &mut encoder {
             Some(child) => child,
             None => encoder.insert(start(program, &picture, &partial)?),
