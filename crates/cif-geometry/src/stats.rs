@@ -1,6 +1,12 @@
 //! Medians and quantiles. Floats are ordered by [`f64::total_cmp`], so that a value which is not a number comes last and
 //! results do not depend on the order of the input.
 
+/// Mean of some values; `None` of none.
+#[must_use]
+pub fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
 /// Median, of an even number the mean of the middle two; `None` of nothing. Sorts `values`.
 pub fn median(values: &mut [f64]) -> Option<f64> {
     values.sort_by(f64::total_cmp);

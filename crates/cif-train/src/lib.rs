@@ -7,6 +7,7 @@
 //! | [`trainer`] | how a run goes through its stages, stops and resumes |
 //! | [`events`] | what a run reports |
 //! | [`phase`], [`phases`] | where the time of a run goes, how far it is, and whether it may go on |
+//! | [`start`] | what a run starts from |
 //! | [`stop`] | how a run is asked to stop |
 //! | [`schedule`] | the stages, what falls on which step (one table), rates over the steps |
 //! | [`losses`] | colour losses and their gradients |
@@ -83,6 +84,7 @@ mod random;
 pub mod schedule;
 mod sightings;
 pub mod stage;
+pub mod start;
 mod state;
 mod step;
 pub mod stop;
@@ -105,8 +107,10 @@ pub use phase::Phase;
 pub use phases::Phases;
 pub use plan::{EffectChoice, EffectPlan};
 pub use stage::Stage;
-pub use stop::{Start, Stop};
+pub use start::Start;
+pub use step::InstancePass;
+pub use stop::Stop;
 pub use times::{StepTimes, Work};
 #[cfg(feature = "wgpu")]
 pub use trainer::Probe;
-pub use trainer::{InstancePass, Trainer, TrainerView, accept_changes};
+pub use trainer::{Trainer, TrainerView, accept_changes};

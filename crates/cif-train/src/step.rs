@@ -15,6 +15,16 @@ use crate::optimiser::StepRates;
 use crate::random::{Purpose, derive};
 use crate::stage::Stage;
 
+/// Switch for the blending of identities in the steps of the instance stage.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum InstancePass {
+    /// As in training.
+    #[default]
+    On,
+    /// Colour only, on the same view.
+    Off,
+}
+
 /// A view of a step.
 #[derive(Clone)]
 pub(crate) struct StepView {

@@ -2,10 +2,6 @@
 
 use std::sync::Arc;
 
-use cif_dataset::Dataset;
-
-use crate::phases::Phases;
-
 /// A question that a run asks again and again: shall it stop? Asked between steps, and between views and the like
 /// wherever the work between two steps takes longer than a step.
 #[derive(Clone, Default)]
@@ -22,20 +18,5 @@ impl Stop {
     #[must_use]
     pub fn requested(&self) -> bool {
         self.0.as_ref().is_some_and(|requested| requested())
-    }
-}
-
-/// A capture to train on, and the phases of the run, which may be watched and stopped from its preparation on. A capture
-/// alone is enough where nobody does.
-pub struct Start {
-    /// Capture.
-    pub dataset: Dataset,
-    /// Phases, of which the caller may have been through some.
-    pub phases: Phases,
-}
-
-impl From<Dataset> for Start {
-    fn from(dataset: Dataset) -> Self {
-        Self { dataset, phases: Phases::default() }
     }
 }

@@ -97,7 +97,7 @@ impl Processor {
             }
         }
         if let Some(head) = plan.head(&head, &state.config).filter(|_| fault.is_none()) {
-            state.head_tensors.step(head, plan.iteration, state.config.stages.instance);
+            heads::step_tensors(head, &mut state.head_tensors, plan.iteration, state.config.stages.instance);
         }
         if fault.is_some() {
             state.head_tensors.reset();

@@ -9,8 +9,9 @@ use crate::clock::{Clock, Seconds};
 use crate::config::{DensifyRule, TrainConfig};
 use crate::error::TrainError;
 use crate::stage::Stage;
+use crate::step::InstancePass;
 use crate::times::StepShares;
-use crate::trainer::{InstancePass, Trainer};
+use crate::trainer::Trainer;
 
 /// Training frames that steps are measured on; decoding more would cost more than it tells.
 const FRAMES: usize = 8;

@@ -9,8 +9,9 @@ use super::calibrate::few_training_frames;
 use crate::config::TrainConfig;
 use crate::error::TrainError;
 use crate::stage::Stage;
+use crate::step::InstancePass;
 use crate::times::StepTimes;
-use crate::trainer::{InstancePass, Trainer};
+use crate::trainer::Trainer;
 
 /// Steps before measuring.
 const WARM_UP: usize = 2;

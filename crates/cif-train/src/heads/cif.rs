@@ -2,7 +2,7 @@
 
 use cif_render::{InstanceSettings, OccupancySource};
 
-use super::{Head, Pass};
+use super::head::{Head, Pass};
 use crate::config::{Ablation, TrainConfig};
 
 /// Occupancies and calibrations of identity rows: parameters of the field.

@@ -8,8 +8,9 @@ use rand::seq::index::sample;
 use rand::{Rng, RngExt};
 use rayon::prelude::*;
 
-use super::tensors::shared;
-use super::{HeadLoss, HeadStep, HeadTensors, HeadView, largest};
+use super::head::{HeadLoss, HeadStep, HeadView};
+use super::labels::largest;
+use super::tensors::{HeadTensors, shared};
 use crate::random::{Purpose, stream};
 
 /// Pixels that one task classifies.

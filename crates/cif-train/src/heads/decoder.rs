@@ -9,7 +9,10 @@ use cif_render::cpu::Renderer;
 use cif_render::{BlendedImage, InstanceImage, RenderSettings, RenderedImage};
 use serde::{Deserialize, Serialize};
 
-use super::{Head, HeadTensors, Target, ValueHead, blended, configured, instance_image, value_head};
+use super::head::{Head, Target, ValueHead, tensors_at_start, value_head};
+use super::labels::{blended, instance_image};
+use super::registry::configured;
+use super::tensors::HeadTensors;
 use crate::config::{HeadConfig, TrainConfig};
 use crate::error::TrainError;
 
@@ -48,7 +51,7 @@ impl Decoder {
         let config = TrainConfig { head: of, ..TrainConfig::default() };
         let values = value_head(&head, &config)
             .ok_or_else(|| unusable(format!("{name} tells labels by identity rows")))?;
-        let mut tensors = HeadTensors::start(values, field, 0);
+        let mut tensors = tensors_at_start(values, field, 0);
         if field.instances.is_empty() || tensors.take_learnt(&saved.tensors).is_none() {
             return Err(unusable(format!("what {name} learnt does not fit the Gaussians of the scene")));
         }

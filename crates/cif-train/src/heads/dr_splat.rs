@@ -15,7 +15,10 @@ use cif_field::Field;
 use cif_field::parameters::{Activation, OnCopy, Parameter, Rows};
 use cif_render::cpu::{ContributorMass, ContributorRule};
 
-use super::{HeadLoss, HeadTensors, HeadValues, HeadView, TrainingViews, ValueHead, largest};
+use super::head::{HeadLoss, HeadValues, HeadView, ValueHead};
+use super::labels::largest;
+use super::tensors::HeadTensors;
+use super::views::TrainingViews;
 use crate::error::TrainError;
 
 /// Contributors of a pixel that count, in the published command.

@@ -19,8 +19,8 @@ use cif_geometry::spherical_harmonics::BAND_0;
 use rand::RngExt;
 
 use super::classifier::{Classifier, biases, neighbours, weights};
-use super::tensors::per_gaussian;
-use super::{HeadLoss, HeadStep, HeadTensors, HeadView, ValueHead};
+use super::head::{HeadLoss, HeadStep, HeadView, ValueHead};
+use super::tensors::{HeadTensors, per_gaussian};
 use crate::adam::EPSILON;
 use crate::random::{Purpose, stream};
 

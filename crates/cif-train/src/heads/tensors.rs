@@ -2,11 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use cif_field::Field;
 use cif_field::checkpoint::StateTensor;
 use cif_field::parameters::{Activation, OnCopy, Parameter, Rows};
 
-use super::ValueHead;
 use crate::adam::{Moments, RowRates};
 use crate::guard::{Fault, MAX_GRADIENT, fault};
 
@@ -46,18 +44,15 @@ struct HeadTensor {
 pub struct HeadTensors(Vec<HeadTensor>);
 
 impl HeadTensors {
-    /// The tensors of a head at the start of the instance stage.
-    pub(crate) fn start(head: &dyn ValueHead, field: &Field, seed: u64) -> Self {
-        let tensor = |parameter: Parameter| {
-            let values = head.start(&parameter, field, seed);
-            HeadTensor {
-                gradients: vec![0.0; values.len()],
-                moments: Moments::zeros(values.len() / parameter.width(), parameter.width()),
-                values,
-                parameter,
-            }
+    /// Tensors with these values, whole rows, and no moments yet.
+    pub(super) fn new(declared: impl IntoIterator<Item = (Parameter, Vec<f32>)>) -> Self {
+        let tensor = |(parameter, values): (Parameter, Vec<f32>)| HeadTensor {
+            gradients: vec![0.0; values.len()],
+            moments: Moments::zeros(values.len() / parameter.width(), parameter.width()),
+            values,
+            parameter,
         };
-        Self(head.parameters().into_iter().map(tensor).collect())
+        Self(declared.into_iter().map(tensor).collect())
     }
 
     /// True before the instance stage.
@@ -147,16 +142,16 @@ impl HeadTensors {
         self.0.iter_mut().for_each(|tensor| tensor.gradients.fill(0.0));
     }
 
-    /// Moves every tensor at a step (from 1) of the `steps` of the stage; gradients become zero.
-    pub(crate) fn step(&mut self, head: &dyn ValueHead, step: u32, steps: u32) {
+    /// Moves every tensor by the learning rate that it has, and the number that Adam adds to the root of its second
+    /// moment; gradients become zero.
+    pub(crate) fn step(&mut self, rate_and_epsilon: impl Fn(&Parameter) -> (f32, f32)) {
         for HeadTensor { parameter, values, gradients, moments } in &mut self.0 {
-            let rate = head.rate(parameter, step, steps);
+            let (rate, epsilon) = rate_and_epsilon(parameter);
             if rate == 0.0 {
                 gradients.fill(0.0);
                 continue;
             }
-            let rates = (RowRates::Uniform(rate), head.epsilon(parameter));
-            let finite = moments.step_with(values, gradients, rates, None);
+            let finite = moments.step_with(values, gradients, (RowRates::Uniform(rate), epsilon), None);
             debug_assert!(finite.is_ok(), "gradients were looked at");
         }
     }

@@ -6,7 +6,7 @@ use cif_geometry::PixelGrid;
 use cif_render::BlendedImage;
 use cif_render::synthetic::{SyntheticConfig, generate};
 
-use super::{HeadStep, HeadTensors, HeadValues, HeadView, ValueHead};
+use super::{HeadStep, HeadTensors, HeadValues, HeadView, ValueHead, tensors_at_start};
 
 /// A moving field of so many Gaussians.
 pub(crate) fn field(gaussians: usize) -> Field {
@@ -31,7 +31,7 @@ pub(crate) fn features(field: &Field) -> PixelGrid<[f32; 3]> {
 
 /// Tensors at the start of the stage.
 pub(crate) fn tensors(head: &dyn ValueHead, field: &Field) -> HeadTensors {
-    HeadTensors::start(head, field, 5)
+    tensors_at_start(head, field, 5)
 }
 
 /// The time that is trained, and the names of random choices.

@@ -1,42 +1,57 @@
 //! The training views as heads may look at them between steps, on the processor.
 
+use cif_dataset::{Dataset, Frame};
 use cif_field::Field;
 use cif_geometry::PixelGrid;
-use cif_render::BlendedImage;
+use cif_render::RenderSettings;
 use cif_render::cpu::{ContributorRule, IdentityCounts, Renderer};
 
-use super::{HeadTensors, ValueHead, blended};
 use crate::error::TrainError;
-use crate::state::State;
+use crate::frames::FrameStore;
+use crate::phases::Phases;
 
 /// Training views with masks, of a field that is up to date.
 pub struct TrainingViews<'a> {
-    pub(crate) state: &'a State,
+    pub(crate) field: &'a Field,
+    pub(crate) dataset: &'a Dataset,
+    pub(crate) frames: &'a FrameStore,
+    pub(crate) phases: &'a Phases,
+    /// Settings of views without instances.
+    pub(crate) settings: RenderSettings,
     pub(crate) renderer: Renderer,
 }
 
-impl TrainingViews<'_> {
+impl<'a> TrainingViews<'a> {
     /// The scene.
     #[must_use]
-    pub fn field(&self) -> &Field {
-        &self.state.field
+    pub fn field(&self) -> &'a Field {
+        self.field
+    }
+
+    /// Settings of views without instances.
+    #[must_use]
+    pub fn settings(&self) -> RenderSettings {
+        self.settings
     }
 
     /// Calls `each` with every training view that has a mask and whose camera `wanted` takes.
-    fn masked(
+    ///
+    /// # Errors
+    /// When a frame cannot be read, or the run is to stop.
+    pub fn each_masked(
         &mut self,
         wanted: &dyn Fn(&str) -> bool,
-        each: &mut dyn FnMut(&mut Renderer, usize, &PixelGrid<u16>),
+        each: &mut dyn FnMut(&mut Renderer, &Frame, &PixelGrid<u16>),
     ) -> Result<(), TrainError> {
-        for view in 0..self.state.frames.len() {
-            self.state.phases.check()?;
-            let index = self.state.frames.index(view);
-            if !wanted(&self.state.dataset.frames[index].camera_name) {
+        for view in 0..self.frames.len() {
+            self.phases.check()?;
+            let frame = &self.dataset.frames[self.frames.index(view)];
+            if !wanted(&frame.camera_name) {
                 continue;
             }
-            let data = self.state.frames.get(&self.state.dataset, view)?;
+            let data = self.frames.get(self.dataset, view)?;
             if let Some(labels) = &data.labels {
-                each(&mut self.renderer, index, labels);
+                each(&mut self.renderer, frame, labels);
             }
         }
         Ok(())
@@ -47,19 +62,11 @@ impl TrainingViews<'_> {
     /// # Errors
     /// When a frame cannot be read, or the run is to stop.
     pub fn count(&mut self, rule: &ContributorRule) -> Result<IdentityCounts, TrainError> {
-        let mut counts = IdentityCounts::zeros(self.state.field.len(), self.state.field.instances.len());
-        let (state, settings) = (self.state, self.state.color_settings());
-        self.masked(&|_| true, &mut |renderer, index, labels| {
-            let frame = &state.dataset.frames[index];
+        let (field, settings) = (self.field, self.settings);
+        let mut counts = IdentityCounts::zeros(field.len(), field.instances.len());
+        self.each_masked(&|_| true, &mut |renderer, frame, labels| {
             let counted = (labels, rule);
-            renderer.count_contributors(
-                &state.field,
-                &frame.camera,
-                frame.time,
-                &settings,
-                counted,
-                &mut counts,
-            );
+            renderer.count_contributors(field, &frame.camera, frame.time, &settings, counted, &mut counts);
         })?;
         Ok(counts)
     }
@@ -74,41 +81,13 @@ impl TrainingViews<'_> {
         rule: &ContributorRule,
         each: &mut dyn FnMut(&IdentityCounts),
     ) -> Result<(), TrainError> {
-        let (state, settings) = (self.state, self.state.color_settings());
-        let labels = state.field.instances.len() + 1;
-        self.masked(&|_| true, &mut |renderer, index, masks| {
-            let frame = &state.dataset.frames[index];
-            let mut counts = IdentityCounts::zeros(state.field.len(), labels);
+        let (field, settings) = (self.field, self.settings);
+        self.each_masked(&|_| true, &mut |renderer, frame, masks| {
+            let mut counts = IdentityCounts::zeros(field.len(), field.instances.len() + 1);
             let shifted = masks.map(|label| label + 1);
             let counted = (&shifted, rule);
-            renderer.count_contributors(
-                &state.field,
-                &frame.camera,
-                frame.time,
-                &settings,
-                counted,
-                &mut counts,
-            );
+            renderer.count_contributors(field, &frame.camera, frame.time, &settings, counted, &mut counts);
             each(&counts);
-        })
-    }
-
-    /// Blends the values of a head over every view that trains it.
-    ///
-    /// # Errors
-    /// When a frame cannot be read, or the run is to stop.
-    pub fn blend(
-        &mut self,
-        head: &dyn ValueHead,
-        tensors: &HeadTensors,
-        each: &mut dyn FnMut(&BlendedImage, &PixelGrid<u16>),
-    ) -> Result<(), TrainError> {
-        let state = self.state;
-        let settings = state.color_settings();
-        self.masked(&|camera| head.trains_on(camera), &mut |renderer, index, labels| {
-            let frame = &state.dataset.frames[index];
-            let view = (&frame.camera, frame.time);
-            each(&blended(renderer, (head, tensors), &state.field, view, &settings), labels);
         })
     }
 }

@@ -7,6 +7,7 @@ use std::time::Instant;
 use cif_dataset::{Dataset, Frame, FrameData, Split};
 use cif_field::Field;
 use cif_geometry::PixelGrid;
+use cif_geometry::stats::mean;
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::{Channels, OccupancySource, RenderSettings, RenderedImage};
 use serde::Serialize;
@@ -342,11 +343,6 @@ fn scores_of<'a>(frames: impl Iterator<Item = &'a FrameScores>, confusions: &[Co
         instance: instance_metrics(&of(|confusions| &confusions.labelled)),
         panoptic: panoptic_metrics(&of(|confusions| &confusions.panoptic)),
     }
-}
-
-/// Mean of some values; `None` of none.
-pub(super) fn mean(values: &[f64]) -> Option<f64> {
-    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
 #[cfg(test)]

@@ -9,10 +9,10 @@
 
 use std::collections::BTreeMap;
 
+use cif_geometry::stats::mean;
 use cif_geometry::{PixelGrid, overlap};
 use serde::Serialize;
 
-use super::evaluate::mean;
 use super::instance::FrameConfusion;
 
 /// Intersection over union from which on a predicted segment is the true one.

@@ -7,14 +7,13 @@ use std::collections::BTreeMap;
 
 use cif_dataset::{Dataset, Split};
 use cif_field::Field;
+use cif_geometry::stats::mean;
 use cif_geometry::{PinholeCamera, PixelGrid};
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::{Channels, InstanceImage, RenderedImage};
 use serde::Serialize;
 
-use super::evaluate::{
-    EvaluationError, EvaluationOptions, Scores, evaluate, mask_ids, mean, trained_settings,
-};
+use super::evaluate::{EvaluationError, EvaluationOptions, Scores, evaluate, mask_ids, trained_settings};
 use super::image::{psnr, unit_color};
 use super::instance::{FrameConfusion, instance_metrics};
 

@@ -10,9 +10,9 @@ use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::fit::log;
+use super::object::STANDS;
 use super::outline::Outline;
 use super::sphere::{Agreement, Side, Texture, take_light_away};
-use super::start::STANDS;
 use super::texture::FEWEST;
 use super::view::{ObjectView, are_discs, median};
 
@@ -454,7 +454,7 @@ fn agreement(sides: &[Side], turns: &[DQuat]) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::outline::outlines;
+    use super::super::outlines::outlines;
     use super::super::testing::{Cameras, TIMES, jumping, patches, rig, solid, sphere_places, views};
     use super::*;
 

@@ -8,7 +8,7 @@ use glam::{DVec2, DVec3};
 use rand::RngExt;
 use rand_pcg::Pcg64;
 
-use super::outline::meeting_of_rays;
+use super::meeting::meeting_of_rays;
 use super::rotation::Ball;
 use super::view::{Crop, ObjectView, median};
 use crate::random::{Purpose, stream};

@@ -6,7 +6,9 @@
 //! | `order` | what cannot hide an object |
 //! | `view` | what a frame shows of an object |
 //! | `plane`, `below` | which plane objects stand on, and which points may lie on it |
-//! | `outline`, `path` | how large an object is, and where it goes |
+//! | `object` | what is known of an object before it is fitted |
+//! | `outline`, `outlines`, `path` | how large an object is, and where it goes |
+//! | `meeting` | where rays through the middles of its masks meet |
 //! | `shape` | its Gaussians alone, against crops |
 //! | `fit` | its poses and Gaussians, moved together |
 //! | `priors` | how it moves where pictures say little |
@@ -32,9 +34,12 @@ mod fit;
 mod follow;
 mod grow;
 mod known;
+mod meeting;
 mod mend;
+mod object;
 mod order;
 mod outline;
+mod outlines;
 mod parts;
 mod path;
 mod plane;
@@ -58,11 +63,12 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 pub(crate) use self::known::KnownObjects;
+use self::object::Object;
+pub(crate) use self::object::Surroundings;
 pub(crate) use self::order::Order;
 pub(crate) use self::parts::Jointed;
 pub(crate) use self::plane::Plane;
-use self::start::Object;
-pub(crate) use self::start::{Fitted, Surroundings};
+pub(crate) use self::start::Fitted;
 pub(crate) use self::trials::BENDS_NO_BETTER;
 use self::view::ObjectView;
 use crate::error::TrainError;
@@ -138,7 +144,7 @@ pub(crate) fn fit(
     is_told: bool,
 ) -> Result<Found, TrainError> {
     let views = views_of(label, dataset, frames, surroundings)?;
-    let outlines = outline::outlines(&views, surroundings.plane, surroundings.times);
+    let outlines = outlines::outlines(&views, surroundings.plane, surroundings.times);
     if outlines.is_empty() {
         return Ok(if views.is_empty() { Found::Nothing } else { Found::Nowhere });
     }
@@ -163,7 +169,7 @@ pub(crate) fn find_part(
     surroundings: Surroundings<'_>,
 ) -> Result<Option<Jointed>, TrainError> {
     let views = views_of(label, dataset, frames, surroundings)?;
-    let outlines = outline::outlines(&views, surroundings.plane, surroundings.times);
+    let outlines = outlines::outlines(&views, surroundings.plane, surroundings.times);
     // It rests: as standing, which is the first of its outlines.
     let object = Object::by_outlines(label, &views, &outlines, false, surroundings).into_iter().next();
     let found = object.map_or(Ok(None), parts::find)?;

@@ -271,7 +271,7 @@ mod tests {
             (0..TIMES).map(|time| (DQuat::IDENTITY, DVec3::new(0.0, 0.0, up(time)))).collect();
         let mut views = views(solid(&sphere_places(0.05), |_| [0.8, 0.5, 0.2], 0.006), &truth, rig);
         views.iter_mut().step_by(5).for_each(|view| view.cut = true);
-        let outline = super::super::outline::outlines(&views, None, TIMES).remove(0);
+        let outline = super::super::outlines::outlines(&views, None, TIMES).remove(0);
         let path = smooth(&outline.path, &views, TIMES, &outline);
         assert!((path[&12] - truth[12].1).length() < 0.03, "{:?}", path[&12]);
     }

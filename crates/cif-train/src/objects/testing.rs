@@ -11,10 +11,11 @@ use cif_render::{Channels, RenderSettings, synthetic};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rand::RngExt;
 
+use super::object::{Object, Surroundings};
 use super::order::Order;
-use super::outline;
+use super::outline::Outline;
+use super::outlines;
 use super::plane::Plane;
-use super::start::{Object, Surroundings};
 use super::view::{ObjectView, set_visible};
 use crate::frames::TrainFrame;
 use crate::mask_table::MaskTable;
@@ -131,7 +132,7 @@ pub(super) fn with_objects<T>(
     views: &[ObjectView],
     act: impl FnOnce(&[Object<'_>]) -> T,
 ) -> T {
-    let outlines = outline::outlines(views, plane, TIMES);
+    let outlines = outlines::outlines(views, plane, TIMES);
     let phases = Phases::default();
     let order = Order::among(&[], 2);
     let surroundings = Surroundings {
@@ -148,12 +149,8 @@ pub(super) fn with_objects<T>(
 }
 
 /// The outline of an object of this height and radius, and roundness, which stays on its support along a path.
-pub(super) fn shaped(
-    (height, radius): (f64, f64),
-    roundness: f64,
-    path: BTreeMap<usize, DVec3>,
-) -> outline::Outline {
-    outline::Outline {
+pub(super) fn shaped((height, radius): (f64, f64), roundness: f64, path: BTreeMap<usize, DVec3>) -> Outline {
+    Outline {
         height,
         radius,
         roundness,

@@ -11,10 +11,11 @@ use rand::RngExt;
 use super::bend;
 use super::grow::grow;
 use super::mend::mend;
-use super::outline;
+use super::object::Object;
+use super::outlines;
 use super::plane::{self, Plane};
 use super::shape::Pose;
-use super::start::{Fitted, Object, fit_object};
+use super::start::{Fitted, fit_object};
 use super::testing::{
     Cameras, FLOOR, TIMES, camera, jumping, moving, patches, rig, solid, sphere_places, views,
     views_in_masks, views_of_groups, with_objects,
@@ -201,7 +202,8 @@ fn what_shows_a_broader_side_is_not_lifted() {
         .collect();
     let long = sides(DVec3::new(0.04, 0.1, 0.04));
     let views = views(solid(&long, patches, 0.006), &truth, moving);
-    let lifted = outline::outlines(&views, Some(&FLOOR), TIMES).iter().any(|outline| !outline.air.is_empty());
+    let lifted =
+        outlines::outlines(&views, Some(&FLOOR), TIMES).iter().any(|outline| !outline.air.is_empty());
     assert!(lifted, "its size alone would tell that it is lifted");
     let (turn, shift) = errors(&fit(&views).poses, &truth);
     assert!(turn < 6.0 && shift < 0.025, "{turn} deg, {shift} m");
@@ -536,7 +538,7 @@ fn turns_at_times_that_hide_it_go_the_way_of_those_around_them() {
 fn one_camera_without_a_support_says_nothing_of_distances() {
     let truth = vec![(DQuat::IDENTITY, DVec3::ZERO); TIMES];
     let views = views(solid(&box_places(), patches, 0.006), &truth, moving);
-    assert!(outline::outlines(&views, None, TIMES).is_empty());
+    assert!(outlines::outlines(&views, None, TIMES).is_empty());
 }
 
 #[test]

@@ -1,20 +1,8 @@
-//! Colours inside masks, and those that are usual for an object.
-
-use std::collections::BTreeMap;
-
-use super::{Mask, Now};
+//! Distribution of the colours inside a mask.
 
 /// Bins of a channel, and of a colour.
 const BINS: usize = 6;
 const COLORS: usize = BINS * BINS * BINS;
-
-/// Pixels and masks below which the colours of an object are not known.
-pub(super) const FEWEST_PIXELS: usize = 30;
-const FEWEST_MASKS: usize = 8;
-
-/// Rounds in which masks that are unlike the others are left out of what is usual, and how unlike.
-const ROUNDS: usize = 3;
-pub(super) const UNUSUAL: f64 = 0.1;
 
 /// Distribution of colours, summing to one.
 #[derive(Clone, Debug)]
@@ -33,7 +21,7 @@ impl Colors {
         Self(sum)
     }
 
-    fn mean<'a>(all: impl Iterator<Item = &'a Self>) -> Self {
+    pub(super) fn mean<'a>(all: impl Iterator<Item = &'a Self>) -> Self {
         let mut sum = vec![0.0; COLORS];
         let mut count = 0.0_f64;
         for Self(colors) in all {
@@ -66,48 +54,4 @@ fn add(sum: &mut [f64], color: [u8; 3]) {
         }
         sum[bin] += share;
     }
-}
-
-/// Usual colours of an object, and the usual likeness of its masks to them.
-pub(super) struct Usual {
-    colors: Colors,
-    middle: f64,
-}
-
-impl Usual {
-    fn of(masks: &[&Colors]) -> Self {
-        let mut colors = Colors::mean(masks.iter().copied());
-        let mut middle = 1.0;
-        for _ in 0..ROUNDS {
-            let like: Vec<f64> = masks.iter().map(|mask| mask.likeness(&colors)).collect();
-            let mut sorted = like.clone();
-            sorted.sort_by(f64::total_cmp);
-            middle = sorted[sorted.len() / 2];
-            let kept = masks.iter().zip(&like).filter(|(_, like)| **like >= middle - UNUSUAL);
-            colors = Colors::mean(kept.map(|(mask, _)| *mask));
-        }
-        Self { colors, middle }
-    }
-
-    /// Likeness of a mask.
-    pub(super) fn likeness(&self, mask: &Mask) -> f64 {
-        mask.colors.likeness(&self.colors)
-    }
-
-    /// By how much a mask is less like the object than most of its masks are.
-    pub(super) fn unlike(&self, mask: &Mask) -> f64 {
-        self.middle - self.likeness(mask)
-    }
-}
-
-/// Usual colours of the objects with enough masks of enough pixels, by label.
-pub(super) fn usual(frames: &[Now<'_>]) -> BTreeMap<u16, Usual> {
-    let mut masks: BTreeMap<u16, Vec<&Colors>> = BTreeMap::new();
-    for (label, mask) in frames.iter().flatten() {
-        if mask.pixels >= FEWEST_PIXELS {
-            masks.entry(*label).or_default().push(&mask.colors);
-        }
-    }
-    masks.retain(|_, masks| masks.len() >= FEWEST_MASKS);
-    masks.iter().map(|(label, masks)| (*label, Usual::of(masks))).collect()
 }

@@ -4,8 +4,8 @@
 
 use std::collections::BTreeMap;
 
-use super::colors::{Usual, usual};
-use super::{Now, Sequence};
+use super::masks::{Now, Sequence};
+use super::usual::{Usual, usual};
 
 /// Overlap of the mask of one object with that of another in the frame before from which they may be exchanged, and
 /// below which a mask is not where it was.

@@ -8,115 +8,23 @@
 
 mod colors;
 mod exchanges;
+mod masks;
 mod place;
 mod strays;
+mod usual;
 
 use std::collections::BTreeMap;
 
 use cif_geometry::PixelGrid;
 use cif_render::UNLABELLED;
 
-use colors::{Colors, FEWEST_PIXELS, UNUSUAL, usual};
-use place::{Place, places};
-
-/// Pixels below which a mask is too small to be looked at.
-const FEWEST: usize = 8;
+pub(crate) use masks::Seen;
+use masks::{Mask, Now, Sequence};
+use usual::{FEWEST_PIXELS, MOST, UNUSUAL, usual};
 
 /// Likeness to another object from which a mask may show it, and by how much this exceeds the likeness to its own.
 const LIKE: f64 = 0.93;
 const MORE: f64 = 0.12;
-
-/// Largest share of the masks of an object that may be switched, or stray; beyond, nobody knows what is usual.
-const MOST: f64 = 0.4;
-
-/// Captured times between two frames of which one tells of the other.
-const NEAR: usize = 3;
-
-/// A mask of one frame.
-#[derive(Clone, Debug)]
-struct Mask {
-    /// Label in the mask file.
-    label: u16,
-    pixels: usize,
-    colors: Colors,
-    place: Place,
-}
-
-/// Masks of a frame by the label that each of them has now.
-type Now<'a> = BTreeMap<u16, &'a Mask>;
-
-/// The masks of a frame.
-pub(crate) struct Seen {
-    camera: String,
-    time: usize,
-    masks: Vec<Mask>,
-}
-
-impl Seen {
-    /// The masks, if there are any, of an image that a camera took at a time of the capture.
-    pub(crate) fn of(
-        image: &PixelGrid<[u8; 3]>,
-        labels: Option<&PixelGrid<u16>>,
-        camera: &str,
-        time: usize,
-    ) -> Self {
-        let mut seen = Self { camera: camera.to_owned(), time, masks: Vec::new() };
-        let Some(labels) = labels else { return seen };
-        let mut pixels: BTreeMap<u16, Vec<[u8; 3]>> = BTreeMap::new();
-        for (label, color) in labels.pixels.iter().zip(&image.pixels) {
-            if *label != UNLABELLED {
-                pixels.entry(*label).or_default().push(*color);
-            }
-        }
-        let mut places = places(labels);
-        for (label, colors) in pixels.into_iter().filter(|(_, colors)| colors.len() >= FEWEST) {
-            seen.masks.push(Mask {
-                label,
-                pixels: colors.len(),
-                colors: Colors::of(colors.into_iter()),
-                place: places.remove(&label).unwrap_or_default(),
-            });
-        }
-        seen
-    }
-}
-
-/// Frames of one camera in the order of their times.
-struct Sequence {
-    frames: Vec<usize>,
-    times: Vec<usize>,
-}
-
-impl Sequence {
-    /// Those of every camera.
-    fn all(frames: &[Seen]) -> Vec<Self> {
-        let mut cameras: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
-        for (k, frame) in frames.iter().enumerate() {
-            cameras.entry(&frame.camera).or_default().push(k);
-        }
-        let in_order = |mut of: Vec<usize>| {
-            of.sort_by_key(|k| frames[*k].time);
-            Self { times: of.iter().map(|k| frames[*k].time).collect(), frames: of }
-        };
-        cameras.into_values().map(in_order).collect()
-    }
-
-    fn len(&self) -> usize {
-        self.frames.len()
-    }
-
-    /// True where a frame follows that before it closely.
-    fn follows(&self, at: usize) -> bool {
-        at > 0 && self.times[at] - self.times[at - 1] <= NEAR
-    }
-
-    /// The frames closely before and after one.
-    fn near(&self, at: usize) -> Vec<usize> {
-        let before = self.follows(at).then(|| at - 1);
-        let after = (at + 1 < self.len() && self.follows(at + 1)).then_some(at + 1);
-        before.into_iter().chain(after).collect()
-    }
-}
 
 /// New labels of the masks of every frame that show another object, by their old ones; [`UNLABELLED`] for those that
 /// are taken away.

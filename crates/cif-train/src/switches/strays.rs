@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
-use super::colors::{FEWEST_PIXELS, UNUSUAL, Usual, usual};
-use super::{MOST, Mask, Now, Sequence};
+use super::masks::{Mask, Now, Sequence};
+use super::usual::{FEWEST_PIXELS, MOST, UNUSUAL, Usual, usual};
 
 /// By how much less than usual the colours of a mask are those of its object: where nothing is at its place in the
 /// frames before and after, and where these tell nothing, because the object or the camera is too fast.

@@ -1,12 +1,12 @@
 //! Scores while training goes on: on held-out frames when asked, and the points of the run's curve.
 
-use cif_dataset::{Dataset, FrameData, Split};
+use cif_dataset::{FrameData, Split};
+use cif_geometry::stats::mean;
 use cif_render::{Channels, RenderSettings};
 
 use super::Trainer;
 use crate::clock::Seconds;
-use crate::config::TrainConfig;
-use crate::curve::{CurveFrames, CurvePoint};
+use crate::curve::CurvePoint;
 use crate::engine::Views;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
@@ -20,18 +20,6 @@ use crate::stage::Stage;
 /// PSNR that equal images count as, dB.
 const MAX_PSNR: f64 = 100.0;
 
-/// Least training frames per withheld one.
-const FRAMES_PER_WITHHELD: usize = 4;
-
-/// Frames that the curve is measured on, decoded once.
-#[derive(Default)]
-pub(super) struct MeasuredFrames {
-    /// Training frames that are not trained on, as indices of the capture.
-    withheld: Vec<usize>,
-    /// Index in the capture, and what was captured; none before the first point.
-    decoded: Option<Vec<(usize, FrameData)>>,
-}
-
 /// Means over frames.
 struct MeanScores {
     psnr: Option<f64>,
@@ -39,50 +27,6 @@ struct MeanScores {
     iou: Option<f64>,
     miou: Option<f64>,
     macc_pix: Option<f64>,
-}
-
-impl MeasuredFrames {
-    /// Takes the frames to withhold out of the training split.
-    pub(super) fn withhold(dataset: &mut Dataset, config: &TrainConfig) -> Self {
-        let of_split = |dataset: &Dataset| -> Vec<usize> {
-            let frames = dataset.frames.iter().enumerate();
-            frames.filter(|(_, frame)| frame.split == Split::Train).map(|(index, _)| index).collect()
-        };
-        let training = of_split(dataset);
-        let count = (config.report.withhold as usize).min(training.len() / FRAMES_PER_WITHHELD);
-        // Frames with masks tell more; where they are few, all of them are needed for training.
-        let masked: Vec<usize> =
-            training.iter().copied().filter(|index| dataset.frames[*index].mask.is_some()).collect();
-        let pool = if masked.len() >= FRAMES_PER_WITHHELD * count { &masked } else { &training };
-        let withheld: Vec<usize> = (0..count).map(|k| pool[(2 * k + 1) * pool.len() / (2 * count)]).collect();
-        for index in &withheld {
-            dataset.frames[*index].split = Split::Val;
-        }
-        Self { withheld, decoded: None }
-    }
-
-    /// True when a frame belongs to the training split of the capture, though it is not trained on.
-    pub(super) fn withholds(&self, index: usize) -> bool {
-        self.withheld.contains(&index)
-    }
-
-    fn select(&self, dataset: &Dataset, count: usize) -> (CurveFrames, Vec<usize>) {
-        let spread = |pool: Vec<usize>| -> Vec<usize> {
-            let count = count.min(pool.len());
-            (0..count).map(|k| pool[(2 * k + 1) * pool.len() / (2 * count)]).collect()
-        };
-        let of = |split| -> Vec<usize> {
-            let frames = dataset.frames.iter().enumerate();
-            frames.filter(|(_, frame)| frame.split == split).map(|(index, _)| index).collect()
-        };
-        if !self.withheld.is_empty() {
-            return (CurveFrames::Withheld, self.withheld.clone());
-        }
-        match of(Split::Val) {
-            held_out if !held_out.is_empty() => (CurveFrames::HeldOut, spread(held_out)),
-            _ => (CurveFrames::Training, spread(of(Split::Train))),
-        }
-    }
 }
 
 impl Trainer {
@@ -202,8 +146,6 @@ impl Trainer {
                 with_backgrounds.push(of(&with_background(&predicted, &foreground)));
             }
         }
-        let mean =
-            |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
         let scores = instance_metrics(&confusions);
         Ok(MeanScores {
             psnr: mean(&psnrs),

@@ -6,15 +6,16 @@ use cif_field::{Checkpoint, Field};
 use cif_geometry::PinholeCamera;
 use cif_geometry::scalar::logit;
 
-use super::evaluate::MeasuredFrames;
-use super::resume::{SavedState, inputs_of, restore};
+use super::measured_frames::MeasuredFrames;
+use super::resume::{SavedState, restore};
+use super::saved::inputs_of;
 use super::{Trainer, initialize};
 use crate::config::TrainConfig;
 use crate::error::TrainError;
 use crate::phase::Phase;
 use crate::progress::{Progress, Source};
 use crate::stage::Stage;
-use crate::stop::Start;
+use crate::start::Start;
 
 /// Times that differ by less are the same.
 const SAME_TIME: f64 = 1e-9;

@@ -23,7 +23,7 @@ use crate::exposure::Exposures;
 use crate::guard::MAX_ROLLBACKS_IN_A_ROW;
 use crate::optimiser::Optimiser;
 use crate::stage::Stage;
-use crate::trainer::InstancePass;
+use crate::step::InstancePass;
 
 pub(super) fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {
     trainer_with(gpu, |_| {})

@@ -11,7 +11,7 @@ use super::Trainer;
 use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
-use crate::heads::{self, Decoder, HeadTensors, Pass, TrainingViews};
+use crate::heads::{self, Decoder, Pass, TrainingViews};
 use crate::phase::Phase;
 use crate::random::{Purpose, stream};
 use crate::stage::Stage;
@@ -29,7 +29,7 @@ impl Trainer {
         self.fetch()?;
         self.check_cameras()?;
         let _phase = self.state.phases.enter(Phase::Instance, 0);
-        let mut tensors = HeadTensors::start(head, &self.state.field, self.state.config.seed);
+        let mut tensors = heads::tensors_at_start(head, &self.state.field, self.state.config.seed);
         head.begin(&mut tensors, &mut self.training_views())?;
         if skipped {
             head.finish(&mut tensors, &mut self.training_views())?;
@@ -128,7 +128,9 @@ impl Trainer {
     }
 
     fn training_views(&self) -> TrainingViews<'_> {
-        TrainingViews { state: &self.state, renderer: Renderer::new(self.simd) }
+        let State { field, dataset, frames, phases, .. } = &self.state;
+        let (settings, renderer) = (self.state.color_settings(), Renderer::new(self.simd));
+        TrainingViews { field, dataset, frames, phases, settings, renderer }
     }
 
     /// Refuses a camera for training that the capture has not.

@@ -5,7 +5,7 @@ use cif_field::parameters::LOG_CALIBRATIONS;
 use cif_field::{Field, Identities, Instance};
 use cif_render::Gradients;
 
-use super::evaluate::MeasuredFrames;
+use super::measured_frames::MeasuredFrames;
 use super::resume::check_instances;
 use super::{Trainer, initialize};
 use crate::config::TrainConfig;
@@ -13,17 +13,8 @@ use crate::density::with_copies;
 use crate::error::TrainError;
 use crate::random::{Purpose, stream};
 use crate::stage::Stage;
+use crate::step::InstancePass;
 use crate::times::StepTimes;
-
-/// Switch for the blending of identities in the steps of the instance stage.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum InstancePass {
-    /// As in training.
-    #[default]
-    On,
-    /// Colour only, on the same view.
-    Off,
-}
 
 impl Trainer {
     /// A run inside `stage`, for measuring its steps; the optimiser starts there. Without `scene` it begins

@@ -7,6 +7,7 @@
 use serde_json::{Value, json};
 
 use super::Trainer;
+use super::pace::{Pacing, Shares};
 use crate::budget::{Budget, FITS, OtherWork, Pacer, REHEARSAL, StepCosts, TRIALS, weights};
 use crate::curve::{CurvePoint, Targets};
 use crate::error::TrainError;
@@ -25,25 +26,6 @@ const EARLIEST_VERDICT: f64 = 0.3;
 
 /// A trend may be so much too low, dB and points of mIoU.
 const MARGIN: (f64, f64) = (0.5, 2.0);
-
-/// Lengths that follow the steps of a stage, as shares of them.
-#[derive(Clone, Copy, Debug)]
-struct Shares {
-    /// Last densification, of the fine stage.
-    densify: f64,
-    /// Instance stage, of the fine stage.
-    instance: f64,
-    /// Schedule of learning rates, of the fine stage; 0 where it follows the stages anyway.
-    schedule: f64,
-    /// Last resampling, of the instance stage.
-    resample: f64,
-}
-
-/// A budget under way.
-pub(super) struct Pacing {
-    pacer: Pacer,
-    shares: Shares,
-}
 
 impl Trainer {
     /// Makes the stages that are left end inside a budget, each with its share. Steps of the settings are where

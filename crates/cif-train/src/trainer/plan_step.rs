@@ -9,7 +9,7 @@ use rand::RngExt;
 use rand::seq::SliceRandom;
 use rand_pcg::Pcg64;
 
-use super::{InstancePass, Trainer};
+use super::Trainer;
 use crate::adam::PlaneWeights;
 use crate::config::{Ablation, TrainConfig};
 use crate::effects::is_judged;
@@ -24,7 +24,7 @@ use crate::random::{Purpose, stream};
 use crate::schedule::{Due, log_linear, may_halve, schedule_steps};
 use crate::stage::Stage;
 use crate::state::State;
-use crate::step::{HeadTarget, StepPlan, StepView};
+use crate::step::{HeadTarget, InstancePass, StepPlan, StepView};
 
 impl Trainer {
     /// Training views of a stage, those of a head's own cameras where it trains on some alone.

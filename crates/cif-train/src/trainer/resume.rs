@@ -11,18 +11,19 @@ use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::Value;
 
 use super::Trainer;
-use super::evaluate::MeasuredFrames;
+use super::measured_frames::MeasuredFrames;
+use super::saved::{SavedHead, inputs_of};
 use crate::config::TrainConfig;
 use crate::density::DensifyStatistics;
 use crate::error::TrainError;
-use crate::heads::{Cif, Head, HeadTensors, value_head};
+use crate::heads::{Cif, Head, tensors_at_start, value_head};
 use crate::objects::KnownObjects;
 use crate::optimiser::Optimiser;
 use crate::phase::Phase;
 use crate::progress::Progress;
 use crate::stage::Stage;
+use crate::start::Start;
 use crate::state::State;
-use crate::stop::Start;
 
 /// Version of the state. Version 1 does not hold which objects travel: they are searched anew.
 const VERSION: u32 = 2;
@@ -138,12 +139,6 @@ pub(super) fn check_instances(field: &Field, dataset: &Dataset) -> Result<(), Tr
         found: format!("{found:?}"),
         root: dataset.root.clone(),
     })
-}
-
-/// The content of a capture, as a run keeps it.
-pub(super) fn inputs_of(dataset: &Dataset) -> MadeFrom {
-    // Without times of files, so that the same capture gives the same state.
-    MadeFrom::new().capture(dataset, None).by_content()
 }
 
 /// Lets a saved run go on with images, masks, cameras, points and labels that have changed since, and a run begin with the
@@ -294,18 +289,12 @@ impl Trainer {
         let Some(head) = value_head(&head, &self.state.config) else { return Ok(()) };
         if self.state.progress.stage == Stage::Instance {
             let State { field, config, head_tensors, .. } = &mut self.state;
-            *head_tensors = HeadTensors::start(head, field, config.seed);
+            *head_tensors = tensors_at_start(head, field, config.seed);
             let restored = head_tensors.restore(&mut saved.tensors);
             restored.ok_or_else(|| unusable(format!("the tensors of the head {} do not fit", saved.name)))?;
         }
         Ok(())
     }
-}
-
-/// A head that a run was saved with.
-pub(super) struct SavedHead {
-    pub(super) name: String,
-    tensors: BTreeMap<String, StateTensor>,
 }
 
 fn name_of_cif() -> String {

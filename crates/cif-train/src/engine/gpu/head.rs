@@ -10,7 +10,7 @@ use cif_render::{BlendRequest, BlendedImage, GeometryPath};
 use super::{Changed, Engine, GpuEngine};
 use crate::error::TrainError;
 use crate::guard::{Fault, loss_fault};
-use crate::heads::ValueHead;
+use crate::heads::{ValueHead, step_tensors};
 use crate::state::State;
 use crate::step::{StepPlan, StepReport, ViewReport};
 
@@ -112,7 +112,7 @@ impl GpuEngine {
             }
             self.changed(Changed::Gaussians);
         }
-        state.head_tensors.step(head, plan.iteration, state.config.stages.instance);
+        step_tensors(head, &mut state.head_tensors, plan.iteration, state.config.stages.instance);
         Ok(Ok(reports))
     }
 }

@@ -22,8 +22,8 @@ pub mod relevance;
 use cif_field::Field;
 use cif_field::parameters::Parameter;
 
-use super::tensors::per_gaussian;
-use super::{HeadLoss, HeadTensors, HeadView, Target, ValueHead};
+use super::head::{HeadLoss, HeadView, Target, ValueHead};
+use super::tensors::{HeadTensors, per_gaussian};
 
 /// Channels of a code.
 const CODE: usize = 3;

@@ -19,11 +19,11 @@ mod network;
 use cif_field::Field;
 use cif_field::parameters::Parameter;
 
-pub(super) use self::network::Layers;
 use self::network::{CODE, Network};
 use super::classifier::{Classifier, biases, neighbours, weights};
-use super::tensors::shared;
-use super::{HeadLoss, HeadStep, HeadTensors, HeadValues, HeadView, ValueHead, largest};
+use super::head::{HeadLoss, HeadStep, HeadValues, HeadView, ValueHead};
+use super::labels::largest;
+use super::tensors::{HeadTensors, shared};
 
 /// Rate of network and classifier.
 const RATE: f32 = 5e-4;

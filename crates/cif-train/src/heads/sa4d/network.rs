@@ -4,6 +4,7 @@ use cif_render::cpu::{Products, Side};
 use rayon::prelude::*;
 
 use super::super::classifier::uniform;
+use super::super::head::Layers;
 use crate::random::{Purpose, stream};
 
 /// Width of a code.
@@ -27,9 +28,6 @@ const CHUNK: usize = 128;
 
 /// Most places whose layers are kept for the way back, which takes 840 values each.
 const KEPT: usize = 1 << 16;
-
-/// Values of layers, `[places, width]` each, the inputs first.
-pub(in super::super) type Layers = Vec<Vec<f32>>;
 
 /// Most tasks of a backward pass, each with gradients of its own; fixed, so that sums do not depend on threads.
 const TASKS: usize = 16;

@@ -29,8 +29,10 @@ use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64;
 
 use self::contrast::{CODE, contrast};
-use super::tensors::{per_gaussian, shared};
-use super::{HeadLoss, HeadTensors, HeadView, Phase, TrainingViews, ValueHead};
+use super::head::{HeadLoss, HeadView, Phase, ValueHead};
+use super::labels::blended;
+use super::tensors::{HeadTensors, per_gaussian, shared};
+use super::views::TrainingViews;
 use crate::config::HeadName;
 use crate::density::{Rearrangement, keep, with_copies};
 use crate::error::TrainError;
@@ -205,7 +207,10 @@ impl ValueHead for Trace3d {
     fn finish(&self, tensors: &mut HeadTensors, views: &mut TrainingViews<'_>) -> Result<(), TrainError> {
         let instances = views.field().instances.len();
         let (mut sums, mut pixels) = (vec![0.0_f64; instances * CODE], vec![0.0_f64; instances]);
-        views.blend(self, tensors, &mut |blended, labels| {
+        let (field, settings) = (views.field(), views.settings());
+        views.each_masked(&|camera| self.trains_on(camera), &mut |renderer, frame, labels| {
+            let view = (&frame.camera, frame.time);
+            let blended = blended(renderer, (self, tensors), field, view, &settings);
             for (code, label) in blended.pixels().zip(&labels.pixels) {
                 let Some(label) = usize::from(*label).checked_sub(1) else { continue };
                 pixels[label] += 1.0;

@@ -25,8 +25,8 @@ use rand_distr::{Distribution, StandardNormal};
 
 use self::attention::{LANGUAGE, TOKENS};
 use super::classifier::{Classifier, biases, weights};
-use super::tensors::{per_gaussian, shared};
-use super::{CameraBlending, HeadLoss, HeadTensors, HeadValues, HeadView, OwnOpacity, ValueHead};
+use super::head::{CameraBlending, HeadLoss, HeadValues, HeadView, OwnOpacity, ValueHead};
+use super::tensors::{HeadTensors, per_gaussian, shared};
 use crate::random::{Purpose, stream};
 
 /// Standard deviation of language channels at the start.

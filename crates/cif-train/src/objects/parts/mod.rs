@@ -37,10 +37,10 @@ use self::fits::{FINELY, Fit, keep_kinds};
 use self::guesses::Guess;
 use self::scope::Search;
 use super::discs;
-use super::outline::meeting_point;
+use super::meeting::meeting_point;
+use super::object::Object;
 use super::rotation::{Turning, turning};
 use super::shape::Pose;
-use super::start::Object;
 use super::trials::split;
 use crate::error::TrainError;
 

@@ -6,8 +6,8 @@ use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::super::fit::hull;
+use super::super::object::{Object, Surroundings};
 use super::super::shape::{Pose, Shape};
-use super::super::start::{Object, Surroundings};
 use super::super::view::{is_one_camera, median};
 use super::body::{Body, Hinge};
 

@@ -1,0 +1,183 @@
+//! An object that is fitted: what is known of it before, and where fits of it start.
+
+use std::collections::BTreeMap;
+
+use cif_field::tracks::RotationEvidence;
+use glam::{DQuat, DVec3};
+use rand_pcg::Pcg64;
+
+use super::fit::{Fit, hull};
+use super::meeting::meeting_point;
+use super::order::Order;
+use super::outline::Outline;
+use super::plane::Plane;
+use super::shape::{Pose, Shape};
+use super::view::{ObjectView, is_one_camera};
+use super::ways::Way;
+use crate::phases::Phases;
+use crate::random::{Purpose, stream};
+
+/// Times that one camera shows from so many sides that they are begun together, as if the object did not turn between
+/// them.
+const TOGETHER: usize = 7;
+
+/// Step from time to time, of the size, up to which an object that leaves its support stands still on it.
+pub(super) const STANDS: f64 = 0.03;
+
+/// Gaussians of an object that is followed.
+pub(super) const FOLLOWED: usize = 300;
+
+/// Facts about the capture that fits need.
+#[derive(Clone, Copy)]
+pub(crate) struct Surroundings<'a> {
+    /// The plane that objects stand on, where it was found.
+    pub(crate) plane: Option<&'a Plane>,
+    /// Mean direction upwards in the images.
+    pub(crate) up: DVec3,
+    pub(crate) order: &'a Order,
+    pub(crate) times: usize,
+    pub(crate) near: f32,
+    pub(crate) seed: u64,
+    /// Gaussians that an object leaves with.
+    pub(crate) gaussians: usize,
+    pub(crate) phases: &'a Phases,
+}
+
+/// An object to be fitted, with what is known of it.
+#[derive(Clone, Copy)]
+pub(super) struct Object<'a> {
+    pub(super) label: u16,
+    /// In the order of times.
+    pub(super) views: &'a [ObjectView],
+    pub(super) outline: &'a Outline,
+    /// True where it is told to move as a whole.
+    pub(super) is_told: bool,
+    /// Place of the outline among those that the object may have: those beside the first suggest no ways of moving but
+    /// what following finds.
+    pub(super) place: usize,
+    /// Number of these outlines: several are compared with all pixels.
+    pub(super) outlines: usize,
+    pub(super) surroundings: Surroundings<'a>,
+}
+
+/// An object in one of the ways of moving.
+pub(super) struct Started<'a> {
+    pub(super) fit: Fit<'a>,
+    /// Centre of its outline by time, smoothed.
+    pub(super) path: BTreeMap<usize, DVec3>,
+    pub(super) way: Way,
+    pub(super) rotation: RotationEvidence,
+    /// True where no other turn fits as well.
+    pub(super) is_turned: bool,
+    pub(super) error: f64,
+    /// Error of moving without a turn.
+    pub(super) unturned: Option<f64>,
+    /// Error of bending, of that of a rigid object; `None` where it was not asked for.
+    pub(super) bent: Option<f64>,
+    /// Time that shows most of it.
+    pub(super) reference: usize,
+}
+
+impl<'a> Object<'a> {
+    /// An object by each of the outlines that it may have.
+    pub(super) fn by_outlines(
+        label: u16,
+        views: &'a [ObjectView],
+        outlines: &'a [Outline],
+        is_told: bool,
+        surroundings: Surroundings<'a>,
+    ) -> Vec<Self> {
+        let of = |(place, outline)| Object {
+            label,
+            views,
+            outline,
+            is_told,
+            place,
+            outlines: outlines.len(),
+            surroundings,
+        };
+        outlines.iter().enumerate().map(of).collect()
+    }
+
+    /// Random numbers of the object, from their start.
+    pub(super) fn rng(&self) -> Pcg64 {
+        stream(self.surroundings.seed, Purpose::Objects, u64::from(self.label))
+    }
+
+    /// Views at times.
+    pub(super) fn views_at<T>(&self, times: &BTreeMap<usize, T>) -> impl Iterator<Item = usize> {
+        (0..self.views.len()).filter(|view| times.contains_key(&self.views[*view].time_index))
+    }
+
+    /// A fit that starts with poses and a shape.
+    pub(super) fn fit(&self, poses: BTreeMap<usize, Pose>, shape: Shape, rng: Pcg64) -> Fit<'a> {
+        let Surroundings { plane, times, near, .. } = self.surroundings;
+        Fit::new(self.views, (plane.copied(), self.outline), (times, near), poses, shape, rng)
+    }
+
+    /// Gaussians inside the masks in poses.
+    pub(super) fn hull(&self, poses: &BTreeMap<usize, Pose>, count: usize, rng: &mut Pcg64) -> Option<Shape> {
+        let Surroundings { near, phases, .. } = self.surroundings;
+        hull(self.views, poses, (self.outline.size(), None), count, (near, phases), rng)
+    }
+
+    /// Of some times the one that shows most of it: the largest mask, whole if there is one.
+    pub(super) fn best_seen(&self, times: impl Iterator<Item = usize>) -> Option<usize> {
+        let seen = |time: &usize| -> f64 {
+            let of = self.views.iter().filter(|view| view.time_index == *time);
+            of.map(|view| view.area() * (1.0 - 0.7 * view.touched) * if view.cut { 0.2 } else { 1.0 }).sum()
+        };
+        times.max_by(|a, b| seen(a).total_cmp(&seen(b)))
+    }
+
+    /// Time from which an object is followed to others of its path, among `times`, and the object there: as it rests
+    /// before it is lifted, or after; where it looks from one side to the next as if it did not turn; else as one time
+    /// shows it.
+    pub(super) fn first(&self, path: &BTreeMap<usize, DVec3>, times: &[usize]) -> Option<(usize, Fit<'a>)> {
+        let at = |place: DVec3| Pose { rotation: DQuat::IDENTITY, translation: place };
+        let rests = self.rests(path).into_iter().max_by_key(Vec::len).unwrap_or_default();
+        let rests: Vec<usize> = rests.into_iter().filter(|time| times.contains(time)).collect();
+        let reference = self.best_seen(if rests.is_empty() { times } else { &rests }.iter().copied())?;
+        let mut poses = BTreeMap::from([(reference, at(path[&reference]))]);
+        if !rests.is_empty() {
+            let middle = rests.iter().map(|time| path[time]).sum::<DVec3>() / rests.len() as f64;
+            poses.extend(rests.iter().map(|time| (*time, at(middle))));
+        } else if self.outline.is_surrounded && is_one_camera(self.views) {
+            let mut near = times.to_vec();
+            near.sort_by_key(|time| time.abs_diff(reference));
+            poses.extend(near.iter().take(TOGETHER).map(|time| (*time, at(path[time]))));
+        }
+        let upright = self.outline.upright(self.surroundings.plane);
+        let Surroundings { near, phases, .. } = self.surroundings;
+        let bounded: (f64, Option<&dyn Fn(DVec3) -> bool>) = (self.outline.size(), Some(&upright));
+        let shape = hull(self.views, &poses, bounded, FOLLOWED, (near, phases), &mut self.rng())?;
+        let mut fit = self.fit(poses, shape, self.rng());
+        fit.air = self.may_be_off(path);
+        Some((reference, fit))
+    }
+
+    /// Runs of times at which an object stands in one place on its support.
+    pub(super) fn rests(&self, path: &BTreeMap<usize, DVec3>) -> Vec<Vec<usize>> {
+        let air = &self.outline.air;
+        let times: Vec<usize> = path.keys().copied().collect();
+        let stands = |a: &usize, b: &usize| {
+            let step = (path[b] - path[a]).length() / (b - a) as f64;
+            step < STANDS * self.outline.size() && !air.contains(a) && !air.contains(b)
+        };
+        let runs = times.chunk_by(stands).filter(|run| run.len() > 2);
+        runs.map(<[usize]>::to_vec).collect()
+    }
+
+    /// Times at which an object that is followed may be off its support: all at which it does not rest, where it
+    /// leaves it at all.
+    pub(super) fn may_be_off(&self, path: &BTreeMap<usize, DVec3>) -> Vec<usize> {
+        let rests: Vec<usize> = self.rests(path).into_iter().flatten().collect();
+        let leaves = !self.outline.air.is_empty();
+        path.keys().copied().filter(|time| leaves && !rests.contains(time)).collect()
+    }
+
+    /// The place where views see it together.
+    pub(super) fn resting_place(&self, views: &[usize]) -> Option<DVec3> {
+        meeting_point(views.iter().map(|k| (&self.views[*k], self.views[*k].visible.powi(2))))
+    }
+}

@@ -1,0 +1,101 @@
+//! Masks of a frame as they are compared, and the frames of a camera in order.
+
+use std::collections::BTreeMap;
+
+use cif_geometry::PixelGrid;
+use cif_render::UNLABELLED;
+
+use super::colors::Colors;
+use super::place::{Place, places};
+
+/// Pixels below which a mask is too small to be looked at.
+const FEWEST: usize = 8;
+
+/// Captured times between two frames of which one tells of the other.
+const NEAR: usize = 3;
+
+/// A mask of one frame.
+#[derive(Clone, Debug)]
+pub(super) struct Mask {
+    /// Label in the mask file.
+    pub label: u16,
+    pub pixels: usize,
+    pub colors: Colors,
+    pub place: Place,
+}
+
+/// Masks of a frame by the label that each of them has now.
+pub(super) type Now<'a> = BTreeMap<u16, &'a Mask>;
+
+/// The masks of a frame.
+pub(crate) struct Seen {
+    camera: String,
+    time: usize,
+    pub(super) masks: Vec<Mask>,
+}
+
+impl Seen {
+    /// The masks, if there are any, of an image that a camera took at a time of the capture.
+    pub(crate) fn of(
+        image: &PixelGrid<[u8; 3]>,
+        labels: Option<&PixelGrid<u16>>,
+        camera: &str,
+        time: usize,
+    ) -> Self {
+        let mut seen = Self { camera: camera.to_owned(), time, masks: Vec::new() };
+        let Some(labels) = labels else { return seen };
+        let mut pixels: BTreeMap<u16, Vec<[u8; 3]>> = BTreeMap::new();
+        for (label, color) in labels.pixels.iter().zip(&image.pixels) {
+            if *label != UNLABELLED {
+                pixels.entry(*label).or_default().push(*color);
+            }
+        }
+        let mut places = places(labels);
+        for (label, colors) in pixels.into_iter().filter(|(_, colors)| colors.len() >= FEWEST) {
+            seen.masks.push(Mask {
+                label,
+                pixels: colors.len(),
+                colors: Colors::of(colors.into_iter()),
+                place: places.remove(&label).unwrap_or_default(),
+            });
+        }
+        seen
+    }
+}
+
+/// Frames of one camera in the order of their times.
+pub(super) struct Sequence {
+    pub frames: Vec<usize>,
+    pub times: Vec<usize>,
+}
+
+impl Sequence {
+    /// Those of every camera.
+    pub(super) fn all(frames: &[Seen]) -> Vec<Self> {
+        let mut cameras: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
+        for (k, frame) in frames.iter().enumerate() {
+            cameras.entry(&frame.camera).or_default().push(k);
+        }
+        let in_order = |mut of: Vec<usize>| {
+            of.sort_by_key(|k| frames[*k].time);
+            Self { times: of.iter().map(|k| frames[*k].time).collect(), frames: of }
+        };
+        cameras.into_values().map(in_order).collect()
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// True where a frame follows that before it closely.
+    pub(super) fn follows(&self, at: usize) -> bool {
+        at > 0 && self.times[at] - self.times[at - 1] <= NEAR
+    }
+
+    /// The frames closely before and after one.
+    pub(super) fn near(&self, at: usize) -> Vec<usize> {
+        let before = self.follows(at).then(|| at - 1);
+        let after = (at + 1 < self.len() && self.follows(at + 1)).then_some(at + 1);
+        before.into_iter().chain(after).collect()
+    }
+}

@@ -1,0 +1,61 @@
+//! Colours that are usual for an object: those of most of its masks.
+
+use std::collections::BTreeMap;
+
+use super::colors::Colors;
+use super::masks::{Mask, Now};
+
+/// Pixels and masks below which the colours of an object are not known.
+pub(super) const FEWEST_PIXELS: usize = 30;
+const FEWEST_MASKS: usize = 8;
+
+/// Rounds in which masks that are unlike the others are left out of what is usual, and how unlike.
+const ROUNDS: usize = 3;
+pub(super) const UNUSUAL: f64 = 0.1;
+
+/// Largest share of the masks of an object that may be switched, or stray; beyond, nobody knows what is usual.
+pub(super) const MOST: f64 = 0.4;
+
+/// Usual colours of an object, and the usual likeness of its masks to them.
+pub(super) struct Usual {
+    colors: Colors,
+    middle: f64,
+}
+
+impl Usual {
+    fn of(masks: &[&Colors]) -> Self {
+        let mut colors = Colors::mean(masks.iter().copied());
+        let mut middle = 1.0;
+        for _ in 0..ROUNDS {
+            let like: Vec<f64> = masks.iter().map(|mask| mask.likeness(&colors)).collect();
+            let mut sorted = like.clone();
+            sorted.sort_by(f64::total_cmp);
+            middle = sorted[sorted.len() / 2];
+            let kept = masks.iter().zip(&like).filter(|(_, like)| **like >= middle - UNUSUAL);
+            colors = Colors::mean(kept.map(|(mask, _)| *mask));
+        }
+        Self { colors, middle }
+    }
+
+    /// Likeness of a mask.
+    pub(super) fn likeness(&self, mask: &Mask) -> f64 {
+        mask.colors.likeness(&self.colors)
+    }
+
+    /// By how much a mask is less like the object than most of its masks are.
+    pub(super) fn unlike(&self, mask: &Mask) -> f64 {
+        self.middle - self.likeness(mask)
+    }
+}
+
+/// Usual colours of the objects with enough masks of enough pixels, by label.
+pub(super) fn usual(frames: &[Now<'_>]) -> BTreeMap<u16, Usual> {
+    let mut masks: BTreeMap<u16, Vec<&Colors>> = BTreeMap::new();
+    for (label, mask) in frames.iter().flatten() {
+        if mask.pixels >= FEWEST_PIXELS {
+            masks.entry(*label).or_default().push(&mask.colors);
+        }
+    }
+    masks.retain(|_, masks| masks.len() >= FEWEST_MASKS);
+    masks.iter().map(|(label, masks)| (*label, Usual::of(masks))).collect()
+}
