@@ -8,6 +8,7 @@ use cif_field::Field;
 use cif_render::cpu::SimdLevel;
 use cif_render::{Gradients, UNLABELLED};
 
+use super::cost::Reports;
 use super::measured_frames::MeasuredFrames;
 use super::saved::inputs_of;
 use super::saving::Saving;
@@ -191,6 +192,7 @@ impl Trainer {
             last_loss: StepLoss::default(),
             stage_since: None,
             arrived: Vec::new(),
+            reports: Reports::default(),
             state: State {
                 progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),
                 optimiser: Optimiser::new(&field),

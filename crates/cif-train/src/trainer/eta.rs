@@ -1,27 +1,19 @@
 //! How long the rest of a run takes, by what its steps and fits took so far.
 
 use cif_field::Deformation;
+use cif_field::tracks::NO_GROUP;
 
 use super::Trainer;
-use crate::budget::{COARSE, IDENTITY_STEPS_PER_FRAME, INSTANCE, MOVING, PIXELS_OF_FIT, TRAVELS};
+use super::cost::Load;
+use crate::budget::{IDENTITY_STEPS_PER_FRAME, INSTANCE, MOVING, PIXELS_OF_FIT, TRAVELS};
 use crate::config::DensifyRule;
 use crate::phase::Phase;
 use crate::schedule::{Due, may_halve};
 use crate::stage::Stage;
-use crate::times::{StepShares, StepTimes};
-use crate::working_size::PIXEL_SHARE;
+use crate::state::State;
 
 /// Steps of a stage that are looked at for what all of it costs.
 const SAMPLES: u32 = 200;
-
-/// Shares of the steps between two times.
-fn shares(now: &StepTimes, since: &StepTimes) -> Option<StepShares> {
-    let (now, since) = (now.seconds_by_growth(), since.seconds_by_growth());
-    StepShares::of(std::array::from_fn(|part| now[part] - since[part]))
-}
-
-/// Where parts of steps are not timed, as on GPUs.
-const UNKNOWN: StepShares = StepShares { pixels: PIXEL_SHARE, moving: 0.0, fixed: 0.0 };
 
 impl Trainer {
     /// Travelling objects that are not fitted yet.
@@ -33,48 +25,77 @@ impl Trainer {
         travelling.filter(|(label, _)| !self.state.objects.has_poses(*label as u16)).count()
     }
 
-    /// Estimated seconds to the end of the run, within a stage whose steps are done at a rate per second: the budget's
-    /// where there is one, else by steps, by the frames that identities are estimated from, and by the objects that are
-    /// fitted between the coarse and the fine stage. `since`: times of all steps when the rate began to be counted.
-    pub(super) fn eta_s(&self, stage: Stage, rate: f64, since: &StepTimes) -> f64 {
+    /// Estimated seconds to the end of the run: the budget's where there is one, else by steps that cost what the last ones
+    /// did, by the frames that identities are estimated from, and by the objects that are fitted between the coarse and the
+    /// fine stage.
+    pub(super) fn eta_s(&self, stage: Stage) -> f64 {
         if let Some(left_s) = self.budget_left_s() {
             return left_s;
         }
-        let shares = shares(&self.state.times, since).unwrap_or(UNKNOWN);
-        let cost = |stage: Stage| match stage {
-            Stage::Coarse if self.stages.is_dynamic => COARSE,
-            Stage::Instance => INSTANCE,
-            _ => 1.0,
-        };
+        let Some(cost) = self.reports.cost() else { return 0.0 };
         let all = |of: Stage| self.stages.iterations(&self.state.config, of);
         let done = |of: Stage| if of == stage { self.state.progress.iteration } else { 0 };
-        let gaussians = self.state.field.gaussians.len() as f64;
-        let last = self.pixels_of_step(stage, done(stage).max(1));
         let test = self.first_test(stage);
-        let cost_of = |of: Stage, step: u32, pixels: f64| {
-            let more = self.gaussians_at(of, step) / gaussians.max(1.0);
+        let step_s = |of: Stage, step: u32| {
             let is_behind = test.is_some_and(|test| of > stage || step > test);
-            let moving = if is_behind { MOVING } else { 1.0 };
-            shares.cost(pixels / last, more, moving) * cost(of) / cost(stage)
+            let weight = if of == Stage::Instance { INSTANCE } else { 1.0 };
+            weight * cost.step_s(&self.load_at(of, step, is_behind))
         };
         // Costs change slowly but for a few steps, so that some stand for all.
-        let left = |of: Stage| {
+        let left_s = |of: Stage| {
             let (done, all) = (done(of), all(of));
             let every = (all.saturating_sub(done)).div_ceil(SAMPLES).max(1);
             (done + 1..=all)
                 .step_by(every as usize)
-                .map(|step| {
-                    let pixels = self.pixels_of_step(of, step);
-                    cost_of(of, step, pixels) * f64::from(every.min(all + 1 - step))
-                })
+                .map(|step| step_s(of, step) * f64::from(every.min(all + 1 - step)))
                 .sum::<f64>()
         };
         let stages = [Stage::Coarse, Stage::Fine, Stage::Instance].into_iter().filter(|of| *of >= stage);
-        let identity = IDENTITY_STEPS_PER_FRAME
+        let identity_s = IDENTITY_STEPS_PER_FRAME
             * self.frames_of_identities(stage) as f64
-            * cost_of(Stage::Fine, all(Stage::Fine), 1.0);
+            * step_s(Stage::Instance, all(Stage::Instance));
         let fits_s = if stage == Stage::Coarse { self.fits_s() } else { 0.0 };
-        (stages.map(left).sum::<f64>() + identity) / rate.max(1e-9) + fits_s
+        stages.map(left_s).sum::<f64>() + identity_s + fits_s
+    }
+
+    /// Takes in the steps of a stage that were done since the last report.
+    pub(super) fn report_steps(&mut self, stage: Stage, steps: u32) {
+        let State { field, phases, times, .. } = &self.state;
+        let weight = if stage == Stage::Instance { INSTANCE } else { 1.0 };
+        let load = Load {
+            pixels: weight * self.pixels_of_step(stage, self.state.progress.iteration.max(1)),
+            gaussians: weight * field.gaussians.len() as f64,
+            moving: weight * self.moving(),
+        };
+        let stages = [Stage::Coarse, Stage::Fine, Stage::Instance];
+        let at_s = stages.map(|stage| phases.spent(Phase::from(stage)).wall_s).iter().sum();
+        self.reports.add(at_s, *times, steps, &load);
+    }
+
+    /// Gaussians that the deformation network moves.
+    fn moving(&self) -> f64 {
+        let field = &self.state.field;
+        let Some(deformation) = &field.deformation else { return 0.0 };
+        let has_pose = |row: &usize| {
+            field
+                .tracks
+                .as_ref()
+                .is_some_and(|tracks| tracks.group_of.get(*row).is_some_and(|of| *of != NO_GROUP))
+        };
+        let is_still = |row: &usize| deformation.still.get(*row).copied().unwrap_or_default();
+        (0..field.gaussians.len()).filter(|row| !is_still(row) && !has_pose(row)).count() as f64
+    }
+
+    /// What a step to come works on, `is_behind` the first test of which Gaussians stand still.
+    fn load_at(&self, stage: Stage, step: u32, is_behind: bool) -> Load {
+        let gaussians = self.gaussians_at(stage, step);
+        let moves = match self.state.progress.stage {
+            _ if stage == Stage::Coarse || !self.stages.is_dynamic => 0.0,
+            Stage::Coarse => MOVING,
+            _ => self.moving() / (self.state.field.gaussians.len() as f64).max(1.0),
+        };
+        let fewer = if is_behind { MOVING } else { 1.0 };
+        Load { pixels: self.pixels_of_step(stage, step), gaussians, moving: fewer * moves * gaussians }
     }
 
     /// The step of the fine stage that looks for Gaussians that stand still before any does; `None` where this step does not
@@ -145,23 +166,11 @@ impl Trainer {
 mod tests {
     use std::time::Duration;
 
+    use super::super::cost::Reports;
     use super::super::guard_tests::support::{Scene, capture, small_config};
     use super::*;
-
-    #[test]
-    fn costs_grow_with_what_the_parts_of_steps_grow_with() {
-        let known = StepShares { pixels: 0.5, moving: 0.1, fixed: 0.2 };
-        assert!((known.cost(1.0, 1.0, 1.0) - 1.0).abs() < 1e-12);
-        assert!((known.cost(4.0, 2.0, 1.0) - (2.0 + 0.2 + 0.6)).abs() < 1e-12);
-        assert!((known.cost(1.0, 2.0, 0.5) - (0.5 + 0.2 + 2.0 * (0.2 + 0.05))).abs() < 1e-12);
-        let since = StepTimes { total: Duration::from_secs(1), ..StepTimes::default() };
-        let mut now = StepTimes { total: Duration::from_secs(5), ..since };
-        assert_eq!(shares(&now, &since), None, "parts are not timed");
-        (now.losses, now.optimiser_mlp) = (Duration::from_secs(1), Duration::from_secs(2));
-        now.render.deform = Duration::from_millis(500);
-        assert_eq!(shares(&now, &since), Some(StepShares { pixels: 0.25, moving: 0.125, fixed: 0.5 }));
-        assert_eq!(shares(&since, &since), None);
-    }
+    use crate::times::StepTimes;
+    use crate::working_size::PIXEL_SHARE;
 
     #[test]
     fn fits_to_come_are_known_by_the_coarse_steps_where_none_was_tried() {
@@ -205,19 +214,37 @@ mod tests {
         assert_eq!(trainer.gaussians_at(Stage::Instance, 1), 4.0 * now);
         trainer.state.config.densify.rule = DensifyRule::Gradient;
         assert_eq!(trainer.gaussians_at(Stage::Fine, 90), now, "nobody knows");
-        // A step on half-size images takes a second; parts are not timed.
-        let eta_s = trainer.eta_s(Stage::Fine, 1.0, &StepTimes::default());
-        let cost = |pixels: f64| UNKNOWN.cost(4.0 * pixels, 1.0, 1.0);
+        // Steps on half-size images take a second; parts are not timed.
+        let (n, times) = (now, StepTimes::default());
+        let step = |pixels: f64| Load { pixels, gaussians: n, moving: n };
+        trainer.reports.add(0.0, times, 0, &step(0.25));
+        trainer.reports.add(10.0, times, 10, &step(0.25));
+        let cost = |pixels: f64| {
+            let units = |pixels: f64| PIXEL_SHARE * pixels + 1.0 - PIXEL_SHARE;
+            units(pixels) / units(0.25)
+        };
         let identity = IDENTITY_STEPS_PER_FRAME * trainer.frames_of_identities(Stage::Fine) as f64;
-        let expected = 40.0 + (40.0 + identity) * cost(1.0) + 20.0 * cost(4.0);
+        let expected = 40.0 + (40.0 + INSTANCE * identity) * cost(1.0) + 20.0 * cost(4.0);
+        let eta_s = trainer.eta_s(Stage::Fine);
         assert!((eta_s / expected - 1.0).abs() < 1e-6, "{eta_s} {expected}");
-        // One of the size that is worked on takes half a second.
+        // Steps of the size that is worked on take two seconds.
         trainer.state.progress.iteration = 80;
-        let eta_s = trainer.eta_s(Stage::Fine, 2.0, &StepTimes::default());
-        assert!(
-            (eta_s / (10.0 * UNKNOWN.cost(4.0, 1.0, 1.0) + 0.5 * identity) - 1.0).abs() < 1e-6,
-            "{eta_s}"
-        );
+        trainer.reports = Reports::default();
+        trainer.reports.add(0.0, times, 0, &step(1.0));
+        trainer.reports.add(20.0, times, 10, &step(1.0));
+        let expected = 2.0 * (20.0 * cost(4.0) / cost(1.0) + INSTANCE * identity);
+        let eta_s = trainer.eta_s(Stage::Fine);
+        assert!((eta_s / expected - 1.0).abs() < 1e-6, "{eta_s} {expected}");
+        // Reports take in what moves: all at first.
+        trainer.reports = Reports::default();
+        trainer.state.times.steps = 1;
+        trainer.report_steps(Stage::Fine, 0);
+        assert_eq!(trainer.moving(), n);
+        trainer.state.field.deformation.as_mut().unwrap().still = (0..now as usize).map(|k| k > 2).collect();
+        assert_eq!(trainer.moving(), 3.0);
+        assert_eq!(trainer.load_at(Stage::Fine, 90, false).moving, 3.0);
+        assert_eq!(trainer.load_at(Stage::Coarse, 90, false).moving, 0.0);
+        trainer.state.field.deformation.as_mut().unwrap().still.clear();
         // Before it is known what stands still, fewer will move behind the first test.
         trainer.shows_changes = false;
         trainer.state.config.effects.still_every = 10;

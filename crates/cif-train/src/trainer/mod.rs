@@ -19,7 +19,7 @@
 //! | `saved`, `resume` | what is saved, and how a run resumes |
 //! | `measured_frames`, `evaluate` | what a run has reached, on a few frames |
 //! | `pace`, `pacing` | when stages end by time, or by what was reached |
-//! | `eta` | how long the rest of a run takes |
+//! | `cost`, `eta` | what a step costs, and how long the rest of a run takes |
 //! | `saving` | when a run asks to be saved |
 //! | `measure`, `shape` | steps for measuring, and what they work on |
 //! | `backend` | which engine computes the steps |
@@ -33,6 +33,7 @@ mod backend;
 mod continued;
 mod contradicted;
 mod contributions;
+mod cost;
 mod eta;
 mod evaluate;
 mod from_scene;
@@ -82,6 +83,7 @@ use cif_render::cpu::SimdLevel;
 
 #[cfg(feature = "wgpu")]
 pub use self::backend::Probe;
+use self::cost::Reports;
 pub(crate) use self::initialize::{
     automatic_time_nodes, deformation_shape, memory_of_gaussians, memory_of_planes,
 };
@@ -147,6 +149,8 @@ pub struct Trainer {
     stage_since: Option<(Stage, f64)>,
     /// Events of steps that were taken in, not sent yet.
     arrived: Vec<TrainEvent>,
+    /// What its steps took so far.
+    reports: Reports,
 }
 
 impl Trainer {

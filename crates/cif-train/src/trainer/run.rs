@@ -1,6 +1,5 @@
 //! Sequence of the stages of a run, and the points at which it may be stopped.
 
-use std::collections::VecDeque;
 use std::sync::Arc;
 
 use cif_field::tracks::Tracks;
@@ -20,9 +19,7 @@ use crate::phase::Phase;
 use crate::progress::{AfterStep, Progress};
 use crate::schedule::Due;
 use crate::stage::Stage;
-use crate::state::State;
 use crate::step::StepLoss;
-use crate::times::StepTimes;
 
 /// Observer of a run.
 type Observer<'a> = dyn FnMut(&TrainEvent, &TrainerView<'_>) -> Control + 'a;
@@ -44,28 +41,6 @@ impl Requests {
             Control::Save => self.save = true,
             Control::Stop => self.stop = true,
         }
-    }
-}
-
-/// Reports that the time left is estimated from: single ones hold a measurement or a change of the set, or do not.
-const REPORTS: usize = 6;
-
-/// A report of a stage.
-struct Mark {
-    /// Seconds of the stage.
-    at_s: f64,
-    /// Steps of the stage since it was begun or resumed.
-    steps: u32,
-    /// Times of all steps.
-    times: StepTimes,
-    /// Pixels of its steps, relative to those that are worked on.
-    pixels: f64,
-}
-
-impl Mark {
-    /// Steps per second since an earlier one.
-    fn rate_since(&self, earlier: &Self) -> f64 {
-        f64::from(self.steps - earlier.steps) / (self.at_s - earlier.at_s).max(1e-9)
     }
 }
 
@@ -305,7 +280,7 @@ impl Trainer {
         let mut events = Vec::new();
         let phases = self.state.phases.clone();
         let mut steps = 0;
-        let mut marks = VecDeque::from([self.mark(stage, steps)]);
+        self.report_steps(stage, steps);
         self.pace_stage(stage);
         // A budget or a target may change how many there are.
         while self.state.progress.after_step.is_some()
@@ -331,13 +306,8 @@ impl Trainer {
                 && self.done().has(Due::Report)
             {
                 phases.advance_to(u64::from(iteration));
-                marks.push_back(self.mark(stage, steps));
-                // Steps of another size cost something else.
-                let pixels = marks[marks.len() - 1].pixels;
-                while marks.len() > 2 && (marks.len() > REPORTS || marks[0].pixels != pixels) {
-                    marks.pop_front();
-                }
-                let event = self.step_event(stage, iterations, &loss, &marks);
+                self.report_steps(stage, std::mem::take(&mut steps));
+                let event = self.step_event(stage, iterations, &loss);
                 requests.add(self.emit(observer, &event));
             }
             if let Some(share) =
@@ -407,22 +377,8 @@ impl Trainer {
         Ok(())
     }
 
-    /// The report that comes now, after so many steps since the stage was begun or resumed.
-    fn mark(&self, stage: Stage, steps: u32) -> Mark {
-        let State { progress, phases, times, .. } = &self.state;
-        let pixels = self.pixels_of_step(stage, progress.iteration.max(1));
-        Mark { at_s: phases.spent(Phase::from(stage)).wall_s, steps, times: *times, pixels }
-    }
-
-    /// Event of the last of some reports, of which there are two at least.
-    fn step_event(
-        &self,
-        stage: Stage,
-        iterations: u32,
-        loss: &StepLoss,
-        reports: &VecDeque<Mark>,
-    ) -> TrainEvent {
-        let [first, before, last] = [0, reports.len() - 2, reports.len() - 1].map(|report| &reports[report]);
+    /// Event of the last report.
+    fn step_event(&self, stage: Stage, iterations: u32, loss: &StepLoss) -> TrainEvent {
         TrainEvent::Step {
             stage,
             iteration: self.state.progress.iteration,
@@ -433,8 +389,8 @@ impl Trainer {
             unsupported_px: loss.unsupported,
             gaussians: self.state.field.gaussians.len(),
             psnr: self.state.progress.psnr.unwrap_or(0.0),
-            iterations_per_second: last.rate_since(before),
-            eta_s: self.eta_s(stage, last.rate_since(first), &first.times),
+            iterations_per_second: self.reports.rate(),
+            eta_s: self.eta_s(stage),
         }
     }
 

@@ -1,0 +1,187 @@
+//! The cost of a step, by what the last ones took.
+
+use std::collections::VecDeque;
+
+use crate::budget::COARSE;
+use crate::times::StepTimes;
+use crate::working_size::PIXEL_SHARE;
+
+/// Share of the time of all steps so far whose steps are looked at, and limits of that time, seconds: single reports hold
+/// a change of the set of Gaussians or a test of an effect, or do not, and machines do not stay as fast as they were.
+const RECENT: f64 = 1.0 / 3.0;
+const SHORTEST_S: f64 = 10.0;
+const LONGEST_S: f64 = 60.0;
+
+/// What steps work on.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Load {
+    /// Pixels of their images, relative to those that are worked on.
+    pub pixels: f64,
+    /// Gaussians.
+    pub gaussians: f64,
+    /// Of these, those that the deformation network moves.
+    pub moving: f64,
+}
+
+/// The steps of a run so far, at a report.
+#[derive(Clone, Copy, Debug, Default)]
+struct Report {
+    /// Seconds of all steps, with what passed between them.
+    at_s: f64,
+    /// Times of their parts.
+    times: StepTimes,
+    /// Number of steps, and the sums of what they worked on.
+    steps: f64,
+    load: Load,
+}
+
+/// Reports of a run, the last ones of which tell what a step costs.
+#[derive(Debug, Default)]
+pub(super) struct Reports(VecDeque<Report>);
+
+impl Reports {
+    /// Adds `steps` that were done since the last report, each of which worked on `load`: `at_s` seconds and `times` of all
+    /// steps of the run.
+    pub(super) fn add(&mut self, at_s: f64, times: StepTimes, steps: u32, load: &Load) {
+        let (last, count) = (self.0.back().copied().unwrap_or_default(), f64::from(steps));
+        let load = Load {
+            pixels: last.load.pixels + count * load.pixels,
+            gaussians: last.load.gaussians + count * load.gaussians,
+            moving: last.load.moving + count * load.moving,
+        };
+        self.0.push_back(Report { at_s, times, steps: last.steps + count, load });
+        let window_s = (RECENT * at_s).clamp(SHORTEST_S, LONGEST_S);
+        while self.0.len() > 2 && at_s - self.0[1].at_s >= window_s {
+            self.0.pop_front();
+        }
+    }
+
+    /// Steps per second between the last two reports.
+    pub(super) fn rate(&self) -> f64 {
+        let mut last = self.0.iter().rev();
+        let (Some(last), Some(before)) = (last.next(), last.next()) else { return 0.0 };
+        (last.steps - before.steps) / (last.at_s - before.at_s).max(1e-9)
+    }
+
+    /// The cost of a step; `None` before two reports.
+    pub(super) fn cost(&self) -> Option<StepCost> {
+        let (first, last) = (self.0.front()?, self.0.back()?);
+        let steps = last.steps - first.steps;
+        let load = Load {
+            pixels: last.load.pixels - first.load.pixels,
+            gaussians: last.load.gaussians - first.load.gaussians,
+            moving: last.load.moving - first.load.moving,
+        };
+        let (now, then) = (last.times.seconds_by_growth(), first.times.seconds_by_growth());
+        let parts = std::array::from_fn(|part| now[part] - then[part]);
+        (steps > 0.0).then(|| StepCost::of(steps, &load, last.at_s - first.at_s, parts))
+    }
+}
+
+/// Seconds of a fine step by what it works on.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct StepCost {
+    /// For the pixels of an image of the size that is worked on.
+    pixels_s: f64,
+    /// For each Gaussian.
+    gaussian_s: f64,
+    /// For each Gaussian that moves; `None` where none did.
+    moving_s: Option<f64>,
+    /// Whatever it works on.
+    fixed_s: f64,
+}
+
+impl StepCost {
+    /// By so many steps in all, which took `seconds`, with what passed between them; their parts by what they grow with
+    /// ([`StepTimes::seconds_by_growth`]) are not timed on GPUs.
+    fn of(steps: f64, load: &Load, seconds: f64, [pixels, moving, fixed, total]: [f64; 4]) -> Self {
+        let each = |seconds: f64, of: f64| if of > 0.0 { seconds / of } else { 0.0 };
+        if total <= 0.0 || pixels <= 0.0 {
+            let pixels_s = each(seconds, PIXEL_SHARE * load.pixels + (1.0 - PIXEL_SHARE) * steps);
+            return Self {
+                pixels_s: PIXEL_SHARE * pixels_s,
+                gaussian_s: (1.0 - PIXEL_SHARE) * pixels_s * each(steps, load.gaussians),
+                moving_s: (load.moving > 0.0).then_some(0.0),
+                fixed_s: 0.0,
+            };
+        }
+        let with_others = (seconds / total).max(1.0);
+        let gaussians = (total - pixels - moving - fixed).max(0.0);
+        Self {
+            pixels_s: with_others * each(pixels, load.pixels),
+            gaussian_s: with_others * each(gaussians, load.gaussians),
+            moving_s: (load.moving > 0.0).then(|| with_others * each(moving, load.moving)),
+            fixed_s: with_others * each(fixed, steps),
+        }
+    }
+
+    /// Seconds of a step.
+    pub(super) fn step_s(&self, load: &Load) -> f64 {
+        let still = self.pixels_s * load.pixels + self.gaussian_s * load.gaussians + self.fixed_s;
+        match self.moving_s {
+            Some(moving_s) => still + moving_s * load.moving,
+            None if load.moving > 0.0 => still / COARSE,
+            None => still,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    fn seconds(seconds: f64) -> Duration {
+        Duration::from_secs_f64(seconds)
+    }
+
+    #[test]
+    fn parts_of_steps_grow_with_what_they_work_on() {
+        let load = Load { pixels: 25.0, gaussians: 2e5, moving: 5e4 };
+        // 100 steps: pixels, what moves, and whatever they work on; a tenth of the time passes between them.
+        let cost = StepCost::of(100.0, &load, 11.0, [5.0, 1.0, 2.0, 10.0]);
+        let step = Load { pixels: 0.25, gaussians: 2e3, moving: 500.0 };
+        assert!((cost.step_s(&step) - 0.11).abs() < 1e-12, "{cost:?}");
+        let larger = Load { pixels: 1.0, gaussians: 4e3, moving: 500.0 };
+        assert!((cost.step_s(&larger) - 1.1 * (0.2 + 0.01 + 0.02 + 0.04)).abs() < 1e-12, "{cost:?}");
+        // Before anything moved.
+        let coarse = StepCost::of(100.0, &Load { moving: 0.0, ..load }, 5.0, [4.0, 0.0, 0.0, 5.0]);
+        assert!((coarse.step_s(&step) - 0.05 / COARSE).abs() < 1e-12, "{coarse:?}");
+        assert!((coarse.step_s(&Load { moving: 0.0, ..step }) - 0.05).abs() < 1e-12);
+        // On a GPU.
+        let cost = StepCost::of(100.0, &load, 1.0, [0.0, 0.0, 0.0, 10.0]);
+        assert!((cost.step_s(&step) - 0.01).abs() < 1e-12, "{cost:?}");
+        let ratio = cost.step_s(&larger) / cost.step_s(&step);
+        let units = |pixels, gaussians| PIXEL_SHARE * pixels + (1.0 - PIXEL_SHARE) * gaussians;
+        assert!((ratio - units(1.0, 2.0) / units(0.25, 1.0)).abs() < 1e-12, "{ratio}");
+    }
+
+    #[test]
+    fn single_reports_do_not_decide_but_old_ones_are_forgotten() {
+        let mut reports = Reports::default();
+        let step = Load { pixels: 1.0, gaussians: 1e3, moving: 0.0 };
+        let mut at_s = 0.0;
+        let mut run = |reports: &mut Reports, steps: u32, step_s: f64| {
+            at_s += f64::from(steps) * step_s;
+            let times = StepTimes { total: seconds(at_s), losses: seconds(at_s), ..StepTimes::default() };
+            reports.add(at_s, times, steps, &step);
+        };
+        assert_eq!(reports.cost(), None);
+        run(&mut reports, 0, 0.0);
+        for _ in 0..100 {
+            run(&mut reports, 10, 0.01);
+        }
+        // A report with a second of other work.
+        run(&mut reports, 1, 1.0);
+        assert!((reports.rate() - 1.0).abs() < 1e-9);
+        let cost = reports.cost().unwrap().step_s(&step);
+        assert!((0.01..0.012).contains(&cost), "{cost}");
+        // The machine becomes half as fast, for good.
+        for _ in 0..400 {
+            run(&mut reports, 10, 0.02);
+        }
+        let cost = reports.cost().unwrap().step_s(&step);
+        assert!((cost - 0.02).abs() < 1e-9, "{cost}");
+    }
+}
