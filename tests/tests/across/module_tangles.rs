@@ -19,7 +19,7 @@ const MOST: [(&str, usize); 21] = [
     ("cif-field", 0),
     ("cif-vision", 0),
     ("cif-web", 0),
-    ("cif-render", 5),
+    ("cif-render", 0),
     ("cif-masks", 0),
     ("cif-batch", 0),
     ("cif-capture", 0),

@@ -13,7 +13,7 @@ use fearless_simd::{Level, dispatch, f32x16};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
 
-use super::{LANES, row_sum, unit};
+use super::rows::{LANES, row_sum, unit};
 
 /// Half the window: 11 taps.
 pub(crate) const RADIUS: usize = 5;

@@ -1,3 +1,6 @@
+use cif_geometry::PixelGrid;
+
+use super::rows::unit;
 use super::*;
 
 const WIDTH: usize = 19;

@@ -17,7 +17,7 @@ use super::super::rasterize::TileImage;
 use super::super::rasterize_backward::{TileCotangents, TileInstances, rasterize_tile_backward};
 use super::super::tile::{GROUPS, TilePixels, TilePlace};
 use super::super::timing::timed;
-use super::{CHUNK, NOT_VISIBLE, Renderer};
+use super::state::{CHUNK, NOT_VISIBLE, Renderer};
 use crate::constants::MIN_LABEL_PROBABILITY;
 use crate::{Gradients, InstanceNormalisation, RenderSettings};
 
@@ -94,7 +94,7 @@ impl Renderer {
         let label_mass = timed(&mut times.rasterize_backward, || {
             self.rasterize_backward(field, (v_color, v_alpha), instance_weight, &settings, &mut pairs)
         });
-        self.inspect_pairs(&pairs, &label_mass.values);
+        self.inspection.look_at_pairs(&pairs, &label_mass.values);
         timed(&mut times.project_backward, || self.calibration_backward(field, &label_mass, gradients));
         self.times = times;
         self.splats_backward(field, &pairs, v_displacements, gradients);
@@ -138,7 +138,7 @@ impl Renderer {
                 total.iter_mut().zip(v).for_each(|(total, v)| *total += v);
             }
         }
-        self.inspect_posed_gradients(&v_posed, gradients);
+        self.inspection.look_at_posed_gradients(&v_posed, gradients);
         if let Some(deformation) = deformation {
             timed(&mut times.deform_backward, || {
                 for (total, v) in
@@ -167,7 +167,7 @@ impl Renderer {
                     &mut gradients.gaussians.means,
                 );
             });
-            self.inspect_deformation_gradients(gradients);
+            self.inspection.look_at_deformation_gradients(gradients);
         }
         self.times = times;
     }

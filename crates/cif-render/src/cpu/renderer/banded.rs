@@ -1,4 +1,6 @@
-//! Views drawn in bands of rows, each within a budget of memory.
+//! Pictures of a view: whole, and in bands of rows, each within a budget of memory.
+
+use std::convert::Infallible;
 
 use cif_field::Field;
 use cif_geometry::{PinholeCamera, PixelGrid};
@@ -9,14 +11,11 @@ use super::super::labels::TileLabels;
 use super::super::rasterize::TileImage;
 use super::super::tile::TilePixels;
 use super::super::timing::timed;
-use super::Renderer;
 use super::images::{DrawnIdentities, gather_ranks, gather_tiles, instance_tile_bytes};
+use super::state::Renderer;
 use crate::constants::{MIN_COVERAGE, TILE};
 use crate::image::{InstanceImage, InstanceRanks};
 use crate::{BlendRequest, Blending, Channels, RenderSettings, RenderedImage};
-
-/// Bytes of a band, unless said otherwise: a view of 1920 x 1080 pixels with all channels fits.
-pub(super) const BAND_MEMORY: u64 = 256 << 20;
 
 /// Outputs to render of a view in bands.
 #[derive(Clone, Copy, Debug, Default)]
@@ -89,11 +88,25 @@ impl RenderedBand {
 }
 
 impl Renderer {
-    /// Sets the memory that a band may take, in bytes, which decides how many rows are drawn at once. Pictures do not
-    /// depend on it. The memory of the field and its projected Gaussians, and of a single tile of 16 x 16 pixels with
-    /// all Gaussians that reach it, comes on top.
-    pub fn set_band_memory(&mut self, bytes: u64) {
-        self.band_memory = bytes;
+    /// Renders a view for looking at or measuring. Beside the image, memory is that of [`Self::render_bands`].
+    pub fn render(
+        &mut self,
+        field: &Field,
+        camera: &PinholeCamera,
+        time: f64,
+        settings: &RenderSettings,
+        channels: Channels,
+    ) -> RenderedImage {
+        let mut image: Option<RenderedImage> = None;
+        let request = BandRequest { channels, ..BandRequest::default() };
+        let Ok(()) = self.render_bands(field, camera, time, settings, &request, |band| {
+            match &mut image {
+                None => image = Some(band.image),
+                Some(image) => image.append(band.image),
+            }
+            Ok::<(), Infallible>(())
+        });
+        image.expect("a view has a band")
     }
 
     /// Renders a view in bands of rows from top to bottom, and hands each to `take`: memory follows the band, not the
@@ -121,7 +134,8 @@ impl Renderer {
         let tile_bytes = request.tile_bytes(identities.is_some());
         for band in bands(&self.tape.splats, whole, tile_bytes, self.band_memory) {
             let band = self.draw_band(&band, (camera.width, camera.height), request, identities.as_ref());
-            self.inspect_color(&band.image.color.pixels, band.first_row as usize * camera.width as usize);
+            let above = band.first_row as usize * camera.width as usize;
+            self.inspection.look_at_color(&band.image.color.pixels, above);
             take(band)?;
         }
         Ok(())

@@ -14,7 +14,7 @@ use super::super::pixels::LANES;
 use super::super::project_backward::SplatGradient;
 use super::super::tile::{GROUPS, TilePixels, pixel_in_tile};
 use super::super::timing::timed;
-use super::{CHUNK, NOT_VISIBLE, Renderer};
+use super::state::{CHUNK, NOT_VISIBLE, Renderer};
 use crate::constants::TILE;
 use crate::{BlendRequest, BlendedImage, Blending, GeometryPath, Gradients, RenderSettings};
 
@@ -104,7 +104,7 @@ impl Renderer {
         });
         self.times = times;
         if let Some(weights) = weights {
-            self.inspect_pairs(&gradients, &[]);
+            self.inspection.look_at_pairs(&gradients, &[]);
             self.splats_backward(weights.field, &gradients, &[], weights.gradients);
         }
     }

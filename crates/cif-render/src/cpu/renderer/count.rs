@@ -10,7 +10,7 @@ use super::super::contributors::{ContributorRule, contributors_of_tile};
 use super::super::counts::{IdentityCounts, add_to};
 use super::super::identity::label_mass_tile;
 use super::super::labels::TileLabels;
-use super::{CHUNK, NOT_VISIBLE, Renderer};
+use super::state::{CHUNK, NOT_VISIBLE, Renderer};
 use crate::RenderSettings;
 
 impl Renderer {

@@ -1,13 +1,38 @@
-//! Motion without pictures: where the deformation puts the centres, and its gradients by that alone.
+//! Motion without pictures: Gaussians at a time, and the gradients of the deformation by where it puts the centres.
 
 use cif_field::parameters::SH_COEFFICIENTS;
+use cif_field::tracks::TracksAtTime;
 use cif_field::{Field, Gaussians};
 
 use super::super::deform::DeformationAtTime;
-use super::Renderer;
+use super::pose::pose;
+use super::state::Renderer;
 use crate::Gradients;
 
+/// Highest degree of the spherical harmonics that Gaussians have.
+const ALL_DEGREES: u8 = 3;
+
 impl Renderer {
+    /// The canonical Gaussians moved to a time: every array in raw form, deltas added (methods reference 2.3),
+    /// then moved by their tracks.
+    pub fn deform(&mut self, field: &Field, time: f64) -> Gaussians {
+        self.posed_gaussians(field, field.tracks.as_ref().map(|tracks| tracks.at(time)), time)
+    }
+
+    /// As [`Self::deform`], with what is hidden at the time as if it were not.
+    pub fn deform_unhidden(&mut self, field: &Field, time: f64) -> Gaussians {
+        let tracks = field.tracks.as_ref().map(|tracks| tracks.at(time).unhidden());
+        self.posed_gaussians(field, tracks, time)
+    }
+
+    fn posed_gaussians(&mut self, field: &Field, tracks: Option<TracksAtTime<'_>>, time: f64) -> Gaussians {
+        let mut posed = Gaussians::default();
+        let deformation =
+            field.deformation.as_ref().map(|deformation| DeformationAtTime::new(deformation, time));
+        pose(self.level, field, deformation, tracks, ALL_DEGREES, &mut posed);
+        posed.or(&field.gaussians)
+    }
+
     /// Centres at the time of the last forward pass or [`Self::displace`]; empty where nothing moves.
     #[must_use]
     pub fn posed_means(&self) -> &[[f32; 3]] {

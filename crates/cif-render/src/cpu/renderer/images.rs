@@ -1,9 +1,7 @@
-//! Pictures of a view: whole, and of instances.
+//! Pixels of tiles as rows of pictures, and instance images.
 
-use std::convert::Infallible;
-
-use cif_field::{Field, Identities};
-use cif_geometry::{PinholeCamera, PixelGrid};
+use cif_field::Identities;
+use cif_geometry::PixelGrid;
 use fearless_simd::dispatch;
 use rayon::prelude::*;
 
@@ -13,11 +11,9 @@ use super::super::dense::{InstanceTile, instance_tile};
 use super::super::labels::IdentityRows;
 use super::super::pixels::LANES;
 use super::super::tile::{GROUPS, pixel_in_tile};
-use super::Renderer;
-use super::banded::BandRequest;
+use super::state::Renderer;
 use crate::constants::TILE;
 use crate::image::InstanceRanks;
-use crate::{Channels, RenderSettings, RenderedImage};
 
 /// Identities, with the probabilities and labelled shares that the instance pass reads.
 pub(super) struct DrawnIdentities<'a> {
@@ -34,27 +30,6 @@ impl<'a> DrawnIdentities<'a> {
 }
 
 impl Renderer {
-    /// Renders a view for looking at or measuring. Beside the image, memory is that of [`Self::render_bands`].
-    pub fn render(
-        &mut self,
-        field: &Field,
-        camera: &PinholeCamera,
-        time: f64,
-        settings: &RenderSettings,
-        channels: Channels,
-    ) -> RenderedImage {
-        let mut image: Option<RenderedImage> = None;
-        let request = BandRequest { channels, ..BandRequest::default() };
-        let Ok(()) = self.render_bands(field, camera, time, settings, &request, |band| {
-            match &mut image {
-                None => image = Some(band.image),
-                Some(image) => image.append(band.image),
-            }
-            Ok::<(), Infallible>(())
-        });
-        image.expect("a view has a band")
-    }
-
     /// Coverage of the pixels in the last forward pass, 1 minus what light they still let through.
     ///
     /// # Panics

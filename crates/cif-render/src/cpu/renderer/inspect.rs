@@ -3,9 +3,10 @@
 use cif_field::Gaussians;
 use cif_field::parameters::{MEANS, MLP, PLANES, Tensor};
 
+use super::super::labels::TileLabels;
 use super::super::project::Splat;
 use super::super::project_backward::SplatGradient;
-use super::Renderer;
+use super::super::rasterize::TileImage;
 use crate::Gradients;
 
 /// A value that is not finite, where it was first met.
@@ -29,6 +30,15 @@ pub(super) struct Inspection {
 }
 
 impl Inspection {
+    pub(super) fn new(on: bool) -> Self {
+        Self { on, found: None }
+    }
+
+    /// The first value that was found since the last call.
+    pub(super) fn take(&mut self) -> Option<NotFinite> {
+        self.found.take()
+    }
+
     /// Looks at arrays of a part, in their order, unless something was found before.
     fn look<'a>(&mut self, part: &'static str, arrays: impl IntoIterator<Item = (&'a str, &'a [f32])>) {
         if self.found.is_some() {
@@ -69,96 +79,83 @@ impl Inspection {
             })
         });
     }
-}
-
-impl Renderer {
-    /// Looks at every array between field and gradients from now on, which costs time; results do not change.
-    pub fn set_inspection(&mut self, on: bool) {
-        self.inspection = Inspection { on, found: None };
-    }
-
-    /// The first value since the last call that was not finite; always `None` without
-    /// [`Self::set_inspection`].
-    pub fn take_not_finite(&mut self) -> Option<NotFinite> {
-        self.inspection.found.take()
-    }
 
     /// After the Gaussians were moved to the time of the view.
-    pub(super) fn inspect_posed(&mut self) {
-        if !self.inspection.on {
+    pub(super) fn look_at_posed(&mut self, posed: &Gaussians) {
+        if !self.on {
             return;
         }
-        self.inspection.look_at_tensors("deform", "posed ", &self.tape.posed.tensors());
+        self.look_at_tensors("deform", "posed ", &posed.tensors());
     }
 
     /// After projection.
-    pub(super) fn inspect_splats(&mut self) {
-        if self.inspection.on {
+    pub(super) fn look_at_splats(&mut self, splats: &[Splat]) {
+        if self.on {
             let floats = |s: &Splat| {
                 let ([mx, my], [l00, l01, l11], [r, g, b]) = (s.mean, s.factor, s.color);
                 [mx, my, l00, l01, l11, r, g, b, s.opacity, s.occupancy, s.depth, s.order]
             };
-            self.inspection.look_at_rows("project", "splats", &self.tape.splats, floats);
+            self.look_at_rows("project", "splats", splats, floats);
         }
     }
 
     /// After blending: rows of the image, of which so many pixels lie above.
-    pub(super) fn inspect_color(&mut self, color: &[[f32; 3]], above: usize) {
-        if self.inspection.on && self.inspection.found.is_none() {
-            self.inspection.look("rasterize", [("colour", color.as_flattened())]);
-            if let Some(found) = &mut self.inspection.found {
+    pub(super) fn look_at_color(&mut self, color: &[[f32; 3]], above: usize) {
+        if self.on && self.found.is_none() {
+            self.look("rasterize", [("colour", color.as_flattened())]);
+            if let Some(found) = &mut self.found {
                 found.index += 3 * above;
             }
         }
     }
 
     /// After blending with labels.
-    pub(super) fn inspect_labelled_tiles(&mut self) {
-        if !self.inspection.on {
+    pub(super) fn look_at_labelled_tiles(&mut self, tiles: &[TileImage], labels: &[Option<TileLabels>]) {
+        if !self.on {
             return;
         }
-        let labels = self.tape.tiles.iter().zip(&self.tape.labels).filter(|(_, labels)| labels.is_some());
-        for (tile, _) in labels {
+        let labelled = tiles.iter().zip(labels).filter(|(_, labels)| labels.is_some());
+        for (tile, _) in labelled {
             let arrays = [
                 ("label probability of a tile", tile.label_probability.as_flattened()),
                 ("instance transmittance of a tile", tile.instance_transmittance.as_flattened()),
             ];
-            self.inspection.look("rasterize", arrays);
+            self.look("rasterize", arrays);
         }
     }
 
     /// After the gradients of (tile, splat) pairs.
-    pub(super) fn inspect_pairs(&mut self, pairs: &[SplatGradient], label_mass: &[f32]) {
-        if self.inspection.on {
+    pub(super) fn look_at_pairs(&mut self, pairs: &[SplatGradient], label_mass: &[f32]) {
+        if self.on {
             let floats = |v: &SplatGradient| {
                 let ([mx, my], [m00, m01, m11], [r, g, b]) = (v.mean, v.moments, v.color);
                 [mx, my, m00, m01, m11, r, g, b, v.opacity, v.responsibility]
             };
-            self.inspection.look_at_rows("rasterize backward", "splat gradients of tiles", pairs, floats);
-            self.inspection.look("rasterize backward", [("label mass of tiles", label_mass)]);
+            self.look_at_rows("rasterize backward", "splat gradients of tiles", pairs, floats);
+            self.look("rasterize backward", [("label mass of tiles", label_mass)]);
         }
     }
 
     /// After the gradients of the moved Gaussians.
-    pub(super) fn inspect_posed_gradients(&mut self, v_posed: &Gaussians, gradients: &Gradients) {
-        if !self.inspection.on {
+    pub(super) fn look_at_posed_gradients(&mut self, v_posed: &Gaussians, gradients: &Gradients) {
+        if !self.on {
             return;
         }
-        self.inspection.look_at_tensors("project backward", "gradient of posed ", &v_posed.tensors());
+        self.look_at_tensors("project backward", "gradient of posed ", &v_posed.tensors());
         // Centres, planes and network get more from the deformation.
         let whole = |(parameter, _): &Tensor<'_>| ![MEANS, PLANES, MLP].contains(parameter);
         let tensors: Vec<Tensor<'_>> = gradients.tensors().into_iter().filter(whole).collect();
-        self.inspection.look_at_tensors("project backward", "gradient of ", &tensors);
-        self.inspection.look("project backward", [("screen gradient", gradients.screen.as_flattened())]);
+        self.look_at_tensors("project backward", "gradient of ", &tensors);
+        self.look("project backward", [("screen gradient", gradients.screen.as_flattened())]);
     }
 
     /// After the gradients of the deformation.
-    pub(super) fn inspect_deformation_gradients(&mut self, gradients: &Gradients) {
-        if self.inspection.on {
+    pub(super) fn look_at_deformation_gradients(&mut self, gradients: &Gradients) {
+        if self.on {
             let moved = [PLANES, MLP, MEANS];
             let of = |wanted| gradients.tensors().into_iter().find(|(parameter, _)| *parameter == wanted);
             let tensors: Vec<Tensor<'_>> = moved.into_iter().filter_map(of).collect();
-            self.inspection.look_at_tensors("deform backward", "gradient of ", &tensors);
+            self.look_at_tensors("deform backward", "gradient of ", &tensors);
         }
     }
 }

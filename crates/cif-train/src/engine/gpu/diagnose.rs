@@ -4,8 +4,8 @@ use cif_render::cpu::SimdLevel;
 
 use super::super::processor::Processor;
 use super::super::validation;
-use super::GpuEngine;
-use super::step::Recording;
+use super::gpu_engine::GpuEngine;
+use super::recording::Recording;
 use crate::error::TrainError;
 use crate::guard::Fault;
 use crate::state::State;

@@ -8,7 +8,7 @@ use cif_render::wgpu::{
 };
 
 use super::super::Views;
-use super::GpuEngine;
+use super::gpu_engine::GpuEngine;
 use super::resident::ResidentDeformation;
 use crate::error::TrainError;
 use crate::state::State;

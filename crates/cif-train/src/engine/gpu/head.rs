@@ -7,7 +7,8 @@ use cif_field::parameters::OCCUPANCY_LOGITS;
 use cif_render::wgpu::{BlendWeightGradients, Commands, DeviceIdentities, GpuVec, ViewInput};
 use cif_render::{BlendRequest, BlendedImage, GeometryPath};
 
-use super::{Changed, Engine, GpuEngine};
+use super::super::{Changed, Engine};
+use super::gpu_engine::GpuEngine;
 use crate::error::TrainError;
 use crate::guard::{Fault, loss_fault};
 use crate::heads::{ValueHead, step_tensors};

@@ -4,7 +4,7 @@ use cif_render::UNLABELLED;
 use cif_render::cpu::IdentityCounts;
 use cif_render::wgpu::{Commands, GpuIdentityCounts, ViewInput};
 
-use super::GpuEngine;
+use super::gpu_engine::GpuEngine;
 use crate::error::TrainError;
 use crate::state::State;
 use crate::wgpu::losses::GpuTarget;

@@ -6,7 +6,7 @@ use cif_field::parameters::{LOG_CALIBRATIONS, OPACITY_LOGITS, OnCopy};
 use cif_render::wgpu::gaussians::{COLUMNS, gaussians, geometry, geometry_column};
 use cif_render::wgpu::{Commands, Gpu, GpuError, GpuGaussians, GpuVec};
 
-use super::GpuEngine;
+use super::gpu_engine::GpuEngine;
 use super::resident::{Resident, ResidentIdentities, set_moments, statistic_rows, statistics_of};
 use crate::error::TrainError;
 use crate::stage::Stage;

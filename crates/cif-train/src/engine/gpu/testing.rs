@@ -4,7 +4,7 @@ use std::any::Any;
 
 use cif_render::wgpu::poses::PoseSum;
 
-use super::{FETCH_EVERY, GpuEngine};
+use super::gpu_engine::{FETCH_EVERY, GpuEngine};
 use crate::engine::Engine;
 
 impl GpuEngine {

@@ -6,10 +6,10 @@ use cif_field::parameters::{LOG_CALIBRATIONS, MLP, PLANES};
 use cif_render::wgpu::{Commands, GpuError, GpuStatistics, LabelInput, Submission, ViewInput, faults};
 use cif_render::{InstanceNormalisation, RenderSettings};
 
-use super::GpuEngine;
 use super::flight::{AboutView, LOSS_WORDS, ViewRead};
+use super::gpu_engine::GpuEngine;
+use super::recording::Recording;
 use super::resident::Resident;
-use super::step::Recording;
 use crate::error::TrainError;
 use crate::stage::Stage;
 use crate::state::State;
