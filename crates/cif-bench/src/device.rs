@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use cif_render::Speed;
 use cif_render::wgpu::Gpu;
-use cif_train::wgpu::floors::{StepShape, floor};
+use cif_train::floors::{StepShape, floor};
 use serde::Serialize;
 
 use crate::Error;

@@ -12,6 +12,7 @@
 //! | [`schedule`] | the stages, what falls on which step (one table), rates over the steps |
 //! | [`losses`] | colour losses and their gradients |
 //! | [`fit`] | settings that fit a time budget |
+//! | `floors` | the least that the stages of a step move and compute |
 //! | [`budget`] | how a run fits into the time there is |
 //! | [`curve`] | what a run had reached when |
 //! | [`clock`] | where it reads time |
@@ -62,6 +63,8 @@ pub mod estimate;
 pub mod events;
 pub mod exposure;
 pub mod fit;
+#[cfg(feature = "wgpu")]
+pub mod floors;
 mod frames;
 mod guard;
 mod guidance;

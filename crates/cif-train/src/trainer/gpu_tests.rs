@@ -442,7 +442,7 @@ fn every_stage_of_a_step_has_a_floor() {
         assert_eq!(shape.deformation.is_some(), stage != Stage::Coarse);
         assert_eq!(shape.identity_entries > 0.0, stage == Stage::Instance);
         for (name, _) in trainer.take_gpu_stages() {
-            let floor = crate::wgpu::floors::floor(name, &shape);
+            let floor = crate::floors::floor(name, &shape);
             let floor = floor.unwrap_or_else(|| panic!("{name} has no floor"));
             assert!(floor.bytes.is_finite() && floor.flops.is_finite(), "{name}: {floor:?}");
             assert!(floor.bytes > 0.0 || name == "judge", "{stage}, {name}: {floor:?}");

@@ -3,9 +3,9 @@
 use cif_render::constants::TILE;
 
 use super::Trainer;
+use crate::floors::{DeformationShape, StepShape};
 use crate::stage::Stage;
 use crate::times::StepTimes;
-use crate::wgpu::floors::{DeformationShape, StepShape};
 
 impl Trainer {
     /// Size of a step of the present stage, mean over measured `steps`. Pixels are those of a mean frame;

@@ -13,11 +13,9 @@
 //! | `adam_gaussians.wgsl`, `adam_planes.wgsl`, `adam_network.wgsl`, `adam_exposures.wgsl`, `adam_poses.wgsl` | the optimiser |
 //! | `displacement.wgsl` | holds travelling objects to their paths, everything else to its place |
 //! | `kernels` | the files, and what they share with Rust |
-//! | `floors` | what the stages of a step move and compute at the least |
 //! | `losses`, `exposure`, `judge`, `motion`, `optimiser`, `poses`, `rearrange` | recording them |
 
 pub(crate) mod exposure;
-pub mod floors;
 pub mod judge;
 pub mod kernels;
 pub mod losses;

@@ -13,9 +13,9 @@ use cif_geometry::stats::{median, median_of_sorted};
 use cif_render::Speed;
 #[cfg(feature = "wgpu")]
 use cif_render::wgpu::Gpu;
-use cif_train::metrics::training_config;
 #[cfg(feature = "wgpu")]
-use cif_train::wgpu::floors::{Floor, StepShape};
+use cif_train::floors::{Floor, StepShape};
+use cif_train::metrics::training_config;
 use cif_train::{InstancePass, Stage, StepTimes, Stop, TrainConfig, Trainer};
 use clap::{Args, ValueEnum};
 use serde::Serialize;
