@@ -46,21 +46,20 @@ fn rows<T: Clone>(grid: &PixelGrid<T>, first: u32, like: &PixelGrid<T>) -> Pixel
     PixelGrid::from_pixels(grid.width, like.height, grid.pixels[start..start + like.pixels.len()].to_vec())
 }
 
+/// What both drew.
+fn both<'a, T>(whole: &'a Option<T>, band: &'a Option<T>) -> (&'a T, &'a T) {
+    whole.as_ref().zip(band.as_ref()).expect("both were asked for it")
+}
+
 fn assert_rows(whole: &RenderedBand, band: &RenderedBand) {
     let first = band.first_row;
     assert_eq!(first % TILE, 0);
     let (a, b) = (&whole.image, &band.image);
     assert_eq!(rows(&a.color, first, &b.color), b.color);
     assert_eq!(rows(&a.alpha, first, &b.alpha), b.alpha);
-    let (a_depth, b_depth) = (
-        a.depth.as_ref().expect("this holds in the test"),
-        b.depth.as_ref().expect("this holds in the test"),
-    );
+    let (a_depth, b_depth) = both(&a.depth, &b.depth);
     assert_eq!(&rows(a_depth, first, b_depth), b_depth);
-    let (a, b) = (
-        a.instances.as_ref().expect("this holds in the test"),
-        b.instances.as_ref().expect("this holds in the test"),
-    );
+    let (a, b) = both(&a.instances, &b.instances);
     assert_eq!(rows(&a.label, first, &b.label), b.label);
     for (a, b) in [
         (&a.probability, &b.probability),
@@ -70,18 +69,12 @@ fn assert_rows(whole: &RenderedBand, band: &RenderedBand) {
     ] {
         assert_eq!(&rows(a, first, b), b);
     }
-    let (a, b) = (
-        whole.ranks.as_ref().expect("this holds in the test"),
-        band.ranks.as_ref().expect("this holds in the test"),
-    );
+    let (a, b) = both(&whole.ranks, &band.ranks);
     assert_eq!(a.ranks.len(), b.ranks.len());
     for (a, b) in a.ranks.iter().zip(&b.ranks) {
         assert_eq!((&rows(&a.0, first, &b.0), &rows(&a.1, first, &b.1)), (&b.0, &b.1));
     }
-    let (a, b) = (
-        whole.blended.as_ref().expect("this holds in the test"),
-        band.blended.as_ref().expect("this holds in the test"),
-    );
+    let (a, b) = both(&whole.blended, &band.blended);
     assert_eq!(&rows(a, first, b), b);
 }
 
