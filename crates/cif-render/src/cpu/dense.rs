@@ -48,19 +48,7 @@ pub(super) fn instance_tile<S: Simd>(
     labelled_shares: &[f32],
     tile: &mut InstanceTile,
 ) {
-    // The dictionary of labels that any splat of the tile supports keeps memory independent of K.
-    let mut labels: Vec<u16> = Vec::new();
-    let mut enough = 4096;
-    for entry in entries {
-        labels.extend_from_slice(&rows.labels[rows.entries(splats[entry.rank()].gaussian)]);
-        if labels.len() > enough {
-            labels.sort_unstable();
-            labels.dedup();
-            enough = 4096.max(2 * labels.len());
-        }
-    }
-    labels.sort_unstable();
-    labels.dedup();
+    let labels = supported_labels(splats, entries, rows);
     tile.foreground = [[0.0; LANES]; GROUPS];
     let mut masses = vec![Aligned([[0.0; LANES]; GROUPS]); labels.len()];
 
@@ -110,12 +98,35 @@ pub(super) fn instance_tile<S: Simd>(
             live_instances.finish(group, blended.finished);
         }
     }
+    finish_pixels(&labels, &masses, tile);
+}
 
+/// Labels that any splat of a tile supports, ascending: this dictionary keeps memory independent of K.
+#[inline(always)]
+fn supported_labels(splats: &[Splat], entries: &[TileEntry], rows: IdentityRows<'_>) -> Vec<u16> {
+    let mut labels: Vec<u16> = Vec::new();
+    let mut enough = 4096;
+    for entry in entries {
+        labels.extend_from_slice(&rows.labels[rows.entries(splats[entry.rank()].gaussian)]);
+        if labels.len() > enough {
+            labels.sort_unstable();
+            labels.dedup();
+            enough = 4096.max(2 * labels.len());
+        }
+    }
+    labels.sort_unstable();
+    labels.dedup();
+    labels
+}
+
+/// Sets what the pixels show, from the mass of each label.
+#[inline(always)]
+fn finish_pixels(labels: &[u16], masses: &[Aligned<TilePixels>], tile: &mut InstanceTile) {
     let mut ranked: Vec<(u16, f32)> = Vec::new();
     for group in 0..GROUPS {
         for lane in 0..LANES {
             let (mut best, mut most, mut total) = (0_u16, 0.0_f32, 0.0_f32);
-            for (label, Aligned(mass)) in labels.iter().zip(&masses) {
+            for (label, Aligned(mass)) in labels.iter().zip(masses) {
                 let mass = mass[group][lane];
                 total += mass;
                 if mass > most {
@@ -124,7 +135,7 @@ pub(super) fn instance_tile<S: Simd>(
             }
             let mut entropy = 0.0;
             if total > 0.0 {
-                for Aligned(mass) in &masses {
+                for Aligned(mass) in masses {
                     let share = mass[group][lane] / total;
                     if share > 0.0 {
                         entropy -= share * share.ln();
@@ -136,7 +147,7 @@ pub(super) fn instance_tile<S: Simd>(
                 ranked.extend(
                     labels
                         .iter()
-                        .zip(&masses)
+                        .zip(masses)
                         .map(|(label, Aligned(mass))| (label + 1, mass[group][lane]))
                         .filter(|(_, mass)| *mass > 0.0),
                 );
