@@ -26,105 +26,113 @@ impl Rasterizer {
         labels: Option<LabelInput<'_>>,
         v_colors: &GpuVec<[f32; 4]>,
     ) -> Result<(), GpuError> {
-        let view = self.view;
-        let n = view.gaussians as usize;
-        assert_eq!(v_colors.len(), view.pixels(), "cotangent size");
-        let arrays = &mut self.arrays;
-        arrays.cotangents.resize(gpu, 2 * view.pixels())?;
+        assert_eq!(v_colors.len(), self.view.pixels(), "cotangent size");
+        self.arrays.cotangents.resize(gpu, 2 * self.view.pixels())?;
         self.reserve_sums(gpu)?;
         self.reserve_gradients(gpu)?;
         if let Some(identities) = identities {
             self.gradients.calibrations.resize(gpu, identities.entries.len())?;
         }
-        let arrays = &self.arrays;
-        let kernels = &self.kernels;
-        let uniform = self.uniform.buffer();
+        self.cotangents(gpu, commands, labels, v_colors);
+        self.splats_backward(gpu, commands, identities);
+        self.project_backward(gpu, commands, gaussians);
+        if let Some(identities) = identities.filter(|_| self.view.label_slots != 0) {
+            self.calibrations_backward(gpu, commands, identities);
+        }
+        Ok(())
+    }
+
+    /// Records what pixels carry to the splats: gradients of the losses by their colours and blended values.
+    fn cotangents(
+        &mut self,
+        gpu: &Gpu,
+        commands: &mut Commands<'_>,
+        labels: Option<LabelInput<'_>>,
+        v_colors: &GpuVec<[f32; 4]>,
+    ) {
+        let (arrays, kernel) = (&self.arrays, &self.kernels.cotangents);
+        let label_map = labels.map_or(&arrays.no_labels, |labels| labels.labels);
+        let bindings = [
+            self.uniform.buffer(),
+            arrays.colors.buffer(),
+            arrays.blended.buffer(),
+            label_map.buffer(),
+            v_colors.buffer(),
+            arrays.cotangents.buffer(),
+        ];
+        let cotangents = self.cache.get(gpu, ("cotangents", 0), kernel, &bindings);
+        let groups = workgroups(self.view.pixels(), 64);
+        commands.stage("cotangents", |stage| stage.dispatch(kernel, &cotangents, groups));
+    }
+
+    /// Records the gradients of (tile, splat) pairs, and their sums by splat.
+    fn splats_backward(
+        &mut self,
+        gpu: &Gpu,
+        commands: &mut Commands<'_>,
+        identities: Option<&DeviceIdentities>,
+    ) {
+        let (view, arrays, kernels) = (self.view, &self.arrays, &self.kernels);
+        let (uniform, order) = (self.uniform.buffer(), &arrays.depth.values[self.depth_result]);
         let rows = identities.map_or(&arrays.no_labels, |identities| &identities.row_offsets);
         let identity_entries = identities.map_or(&arrays.no_entries, |identities| &identities.entries);
-        let label_map = labels.map_or(&arrays.no_labels, |labels| labels.labels);
-        let order = &arrays.depth.values[self.depth_result];
-
-        let cotangents = self.cache.get(
-            gpu,
-            ("cotangents", 0),
-            &kernels.cotangents,
-            &[
-                uniform,
-                arrays.colors.buffer(),
-                arrays.blended.buffer(),
-                label_map.buffer(),
-                v_colors.buffer(),
-                arrays.cotangents.buffer(),
-            ],
-        );
-        commands.stage("cotangents", |stage| {
-            stage.dispatch(&kernels.cotangents, &cotangents, workgroups(view.pixels(), 64));
-        });
         let (variant, kernel) = match view.label_slots {
             0 => (0, &kernels.rasterize_backward_color),
             _ => (1, &kernels.rasterize_backward),
         };
-        let backward = self.cache.get(
-            gpu,
-            ("rasterize_backward", variant),
-            kernel,
-            &[
-                uniform,
-                arrays.splats.buffer(),
-                arrays.entries.buffer(),
-                arrays.tile_ranges.buffer(),
-                rows.buffer(),
-                identity_entries.buffer(),
-                arrays.cotangents.buffer(),
-                arrays.pair_sums.buffer(),
-                arrays.label_mass.buffer(),
-            ],
-        );
+        let bindings = [
+            uniform,
+            arrays.splats.buffer(),
+            arrays.entries.buffer(),
+            arrays.tile_ranges.buffer(),
+            rows.buffer(),
+            identity_entries.buffer(),
+            arrays.cotangents.buffer(),
+            arrays.pair_sums.buffer(),
+            arrays.label_mass.buffer(),
+        ];
+        let backward = self.cache.get(gpu, ("rasterize_backward", variant), kernel, &bindings);
         commands.stage("rasterize backward", |stage| {
             stage.dispatch(kernel, &backward, [view.tiles[0], view.tiles[1], 1]);
         });
-        let gather = self.cache.get(
-            gpu,
-            ("gather_gradients", 0),
-            &kernels.gather_gradients,
-            &[
-                uniform,
-                arrays.splats.buffer(),
-                order.buffer(),
-                arrays.pair_offsets.buffer(),
-                arrays.pairs.buffer(),
-                arrays.pair_sums.buffer(),
-                arrays.work.buffer(),
-                arrays.splat_gradients.buffer(),
-            ],
-        );
+        let bindings = [
+            uniform,
+            arrays.splats.buffer(),
+            order.buffer(),
+            arrays.pair_offsets.buffer(),
+            arrays.pairs.buffer(),
+            arrays.pair_sums.buffer(),
+            arrays.work.buffer(),
+            arrays.splat_gradients.buffer(),
+        ];
+        let gather = self.cache.get(gpu, ("gather_gradients", 0), &kernels.gather_gradients, &bindings);
+        let groups = workgroups(view.gaussians as usize, 64);
         commands.stage("gather gradients", |stage| {
-            stage.dispatch(&kernels.gather_gradients, &gather, workgroups(n, 64));
+            stage.dispatch(&kernels.gather_gradients, &gather, groups);
         });
-        self.project_backward(gpu, commands, gaussians);
-        let (arrays, kernels, gradients) = (&self.arrays, &self.kernels, &self.gradients);
-        let (uniform, order) = (self.uniform.buffer(), &arrays.depth.values[self.depth_result]);
-        if let Some(identities) = identities.filter(|_| view.label_slots != 0) {
-            let identity = self.cache.get(
-                gpu,
-                ("identity_backward", 0),
-                &kernels.identity_backward,
-                &[
-                    uniform,
-                    order.buffer(),
-                    arrays.slot_offsets.buffer(),
-                    identities.row_offsets.buffer(),
-                    identities.entries.buffer(),
-                    arrays.label_mass.buffer(),
-                    arrays.work.buffer(),
-                    gradients.calibrations.buffer(),
-                ],
-            );
-            commands.stage("identity backward", |stage| {
-                stage.dispatch(&kernels.identity_backward, &identity, workgroups(n, 64));
-            });
-        }
-        Ok(())
+    }
+
+    /// Records the gradients of the calibrations of identities, from the label mass of the splats.
+    fn calibrations_backward(
+        &mut self,
+        gpu: &Gpu,
+        commands: &mut Commands<'_>,
+        identities: &DeviceIdentities,
+    ) {
+        let (arrays, kernel) = (&self.arrays, &self.kernels.identity_backward);
+        let bindings = [
+            self.uniform.buffer(),
+            arrays.depth.values[self.depth_result].buffer(),
+            arrays.slot_offsets.buffer(),
+            identities.row_offsets.buffer(),
+            identities.entries.buffer(),
+            arrays.label_mass.buffer(),
+            arrays.work.buffer(),
+            self.gradients.calibrations.buffer(),
+        ];
+        let identity = self.cache.get(gpu, ("identity_backward", 0), kernel, &bindings);
+        let groups = workgroups(self.view.gaussians as usize, 64);
+        commands.stage("identity backward", |stage| stage.dispatch(kernel, &identity, groups));
     }
 
     /// Makes room for gradients of splats and Gaussians.
