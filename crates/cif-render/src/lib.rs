@@ -34,6 +34,6 @@ pub use blend::{BlendRequest, BlendedImage, Blending};
 pub use gradients::Gradients;
 pub use image::{Channels, InstanceImage, InstanceRanks, RenderedImage, UNLABELLED};
 pub use motion::screen_motion;
-pub use poses::PoseGradient;
+pub use poses::{GroupedGaussian, PoseGradient};
 pub use settings::{GeometryPath, InstanceNormalisation, InstanceSettings, OccupancySource, RenderSettings};
 pub use speed::Speed;

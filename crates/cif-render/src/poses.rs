@@ -28,14 +28,28 @@ pub struct PoseGradient {
     pub translation: DVec3,
 }
 
+/// A Gaussian of a group, in the frame of the group.
+#[derive(Clone, Copy, Debug)]
+pub struct GroupedGaussian<'a> {
+    /// Centre relative to the pivot.
+    pub offset: [f32; 3],
+    /// Raw quaternion (w, x, y, z).
+    pub quaternion: [f32; 4],
+    /// Coefficients of spherical harmonics.
+    pub sh: &'a [f32; SH_FLOATS],
+}
+
 impl PoseGradient {
-    /// Adds a Gaussian of the group, in the frame of the group: its centre relative to the pivot, raw quaternion and
-    /// harmonics, and the gradients by each; harmonics only where they are differentiated.
+    /// Adds a Gaussian of the group, given the gradients by its parameters in the frame of the group; harmonics only
+    /// where they are differentiated.
     pub fn add(
         &mut self,
-        (offset, quaternion, sh): ([f32; 3], [f32; 4], &[f32; SH_FLOATS]),
-        (v_mean, v_quaternion, v_sh): ([f32; 3], [f32; 4], Option<&[f32; SH_FLOATS]>),
+        gaussian: &GroupedGaussian<'_>,
+        v_mean: [f32; 3],
+        v_quaternion: [f32; 4],
+        v_sh: Option<&[f32; SH_FLOATS]>,
     ) {
+        let GroupedGaussian { offset, quaternion, sh } = *gaussian;
         let v_mean = DVec3::from_array(v_mean.map(f64::from));
         self.translation += v_mean;
         self.turn += DVec3::from_array(offset.map(f64::from)).cross(v_mean);

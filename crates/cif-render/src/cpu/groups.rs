@@ -9,7 +9,7 @@ use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
 use crate::Gradients;
-use crate::poses::PoseGradient;
+use crate::poses::{GroupedGaussian, PoseGradient};
 
 /// Gaussians handled by one task.
 const CHUNK: usize = 512;
@@ -82,8 +82,8 @@ pub(super) fn groups_backward(
                     sums.push((group as u32, PoseGradient::default()));
                 }
                 if let Some((_, sum)) = sums.last_mut() {
-                    let sh = &canonical.sh_coefficients[row];
-                    sum.add((offset, canonical.quaternions[row], sh), (v_mean, v_quaternion, v_sh));
+                    let (quaternion, sh) = (canonical.quaternions[row], &canonical.sh_coefficients[row]);
+                    sum.add(&GroupedGaussian { offset, quaternion, sh }, v_mean, v_quaternion, v_sh);
                 }
                 for axis in 0..3 {
                     total.means[k][axis] += v_mean[axis];

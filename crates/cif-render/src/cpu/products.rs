@@ -52,7 +52,9 @@ impl Products {
     pub fn layer(
         &self,
         [rows, inner, columns]: [usize; 3],
-        (left, right, bias): (&[f32], &[f32], &[f32]),
+        left: &[f32],
+        right: &[f32],
+        bias: &[f32],
         rectify: bool,
         out: &mut [f32],
     ) {

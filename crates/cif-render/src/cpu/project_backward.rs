@@ -9,6 +9,7 @@ use fearless_simd_macros::simd;
 use super::gaussian_lanes::{cross, dot, load_lanes, scaled, splat_matrix, store_lanes, transform_back};
 use super::harmonics::{basis, basis_backward};
 use super::pixels::{LANES, Lanes, splat};
+use super::posed::PosedView;
 use super::project::{Footprint, Posed, SH_BLOCK, Splat, ViewConstants, load_sh, sh_blocks};
 use crate::OccupancySource;
 use crate::constants::MAX_POSITION_GRADIENT;
@@ -53,7 +54,7 @@ impl SplatGradient {
 
 /// Sixteen Gaussians with what is known of the loss by their splats.
 pub(super) struct DrawnGaussians<'a> {
-    /// Raw parameters in the order of [`super::posed::PosedView::row`].
+    /// Raw parameters in the order of [`PosedView::row`].
     pub(super) posed: [Lanes; LANES],
     pub(super) sh: [&'a [f32; SH_FLOATS]; LANES],
     pub(super) gradients: [Lanes; LANES],
@@ -65,16 +66,17 @@ impl<'a> DrawnGaussians<'a> {
         Self { posed: [[0.0; LANES]; LANES], sh: [sh; LANES], gradients: [[0.0; LANES]; LANES] }
     }
 
-    /// Sets a lane.
+    /// Sets a lane to the Gaussian of a splat.
     pub(super) fn set(
         &mut self,
         lane: usize,
-        (posed, sh): (Lanes, &'a [f32; SH_FLOATS]),
+        posed: &PosedView<'a>,
         splat: &Splat,
         gradient: &SplatGradient,
     ) {
-        self.posed[lane] = posed;
-        self.sh[lane] = sh;
+        let gaussian = splat.gaussian as usize;
+        self.posed[lane] = posed.row(gaussian);
+        self.sh[lane] = posed.sh(gaussian);
         self.gradients[lane] = gradient.with(splat);
     }
 }

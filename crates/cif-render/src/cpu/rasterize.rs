@@ -103,7 +103,8 @@ impl<S: Simd> Painted<'_, S> {
         &self,
         simd: S,
         at: &Footprint<S>,
-        (pair, group): (usize, usize),
+        pair: usize,
+        group: usize,
         labels: &TileLabels,
         image: &mut TileImage,
     ) -> bool {
@@ -192,12 +193,12 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
                 let at = prepared.footprint(simd, group);
                 live_color.finish(group, painted.paint_color::<DEPTH>(simd, &at, group, image));
                 live_instances
-                    .finish(group, painted.paint_labels(simd, &at, (pair, group), tile_labels, image));
+                    .finish(group, painted.paint_labels(simd, &at, pair, group, tile_labels, image));
             }
             for group in in_instances.without(in_color) {
                 let at = prepared.footprint(simd, group);
                 live_instances
-                    .finish(group, painted.paint_labels(simd, &at, (pair, group), tile_labels, image));
+                    .finish(group, painted.paint_labels(simd, &at, pair, group, tile_labels, image));
             }
         }
     }

@@ -26,6 +26,19 @@ use crate::GeometryPath;
 /// Undoes the scale of [`Splat::binary_factor`] in a product of two values that carry it.
 const FROM_BINARY: f32 = 2.0 * std::f32::consts::LN_2;
 
+/// A tile with its splats, as the forward pass drew it.
+#[derive(Clone, Copy)]
+pub(super) struct DrawnTile<'a> {
+    /// Splats of the view, in depth order.
+    pub(super) splats: &'a [Splat],
+    /// Those of the tile, front to back.
+    pub(super) entries: &'a [TileEntry],
+    /// Groups of pixels that each entry was evaluated at.
+    pub(super) met: &'a [MetGroups],
+    /// Where the tile lies in the image.
+    pub(super) place: &'a TilePlace,
+}
+
 /// Cotangents of a tile's colours: gradients of the colour loss by them.
 #[repr(C, align(64))]
 pub(super) struct TileCotangents {
@@ -172,7 +185,8 @@ impl<S: Simd> Seen<S> {
         &self,
         simd: S,
         at: &Footprint<S>,
-        (pair, group): (usize, usize),
+        pair: usize,
+        group: usize,
         replay: &mut Replay<'_>,
         sums: &mut Sums<S>,
     ) -> (f32x16<S>, bool) {
@@ -213,14 +227,13 @@ impl<S: Simd> Seen<S> {
 #[simd]
 pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
     simd: S,
-    splats: &[Splat],
-    (entries, met): (&[TileEntry], &[MetGroups]),
-    place: &TilePlace,
+    tile: DrawnTile<'_>,
     cotangents: &mut TileCotangents,
     instances: Option<&TileInstances<'_>>,
     gradients: &mut [SplatGradient],
     label_mass: &mut [f32],
 ) {
+    let DrawnTile { splats, entries, met, place } = tile;
     let (zero, one) = (splat(simd, 0.0), splat(simd, 1.0));
     let blending = BlendingRule::new(simd);
     let mut transmittance = Aligned(place.initial_transmittance());
@@ -279,14 +292,14 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
                 let (v_sigma, finished) =
                     seen.color_backward(simd, &at, group, &mut transmittance.0, cotangents, &mut sums);
                 live_color.finish(group, finished);
-                let (q, finished) = seen.instances_backward(simd, &at, (pair, group), replay, &mut sums);
+                let (q, finished) = seen.instances_backward(simd, &at, pair, group, replay, &mut sums);
                 live_instances.finish(group, finished);
                 let v_sigma_mean = q.mul_add(seen.mean_geometry, v_sigma);
                 sums.add_moments(&at, q.mul_add(seen.full_geometry, v_sigma), v_sigma_mean);
             }
             for group in in_instances.without(in_color) {
                 let at = prepared.footprint(simd, group);
-                let (q, finished) = seen.instances_backward(simd, &at, (pair, group), replay, &mut sums);
+                let (q, finished) = seen.instances_backward(simd, &at, pair, group, replay, &mut sums);
                 live_instances.finish(group, finished);
                 if moves_geometry {
                     sums.add_moments(&at, q * seen.full_geometry, q * seen.mean_geometry);

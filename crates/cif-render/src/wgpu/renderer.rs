@@ -12,7 +12,7 @@ use super::gaussians::{GpuGaussians, PACKED_SH_WORDS, geometry, packed_sh};
 use super::identities::DeviceIdentities;
 use super::kernel::Commands;
 use super::poses::{self, GpuPoses};
-use super::rasterizer::{Coefficients, PosedInput, Rasterizer, ViewInput};
+use super::rasterizer::{Coefficients, PosedGaussians, PosedInput, Rasterizer, ViewInput};
 use crate::constants::{MIN_COVERAGE, TILE};
 use crate::cpu::{Renderer, SimdLevel};
 use crate::image::InstanceImage;
@@ -197,12 +197,19 @@ impl GpuRenderer {
             if deformation.is_some_and(GpuDeformation::moves_sh) {
                 self.posed.sh.resize(&self.gpu, self.canonical.len())?;
             }
-            let motion = (deformation, self.groups.as_ref());
-            poses::pose(&self.gpu, &mut commands, time, motion, &self.canonical, &self.posed)
+            let (groups, canonical) = (self.groups.as_ref(), &self.canonical);
+            poses::pose(&self.gpu, &mut commands, time, deformation, groups, canonical, &self.posed)
         };
         let (gpu, rasterizer) = (&self.gpu, &mut self.rasterizer);
         let sh = self.packed_sh.as_ref().map_or(posed.coefficients(), Coefficients::Packed);
-        rasterizer.project_rows(gpu, &mut commands, (posed.geometry, sh), identities, &input, Some(rows))?;
+        rasterizer.project_rows(
+            gpu,
+            &mut commands,
+            PosedGaussians { geometry: posed.geometry, sh },
+            identities,
+            &input,
+            Some(rows),
+        )?;
         rasterizer.draw_projected(gpu, commands, identities, with_depth)
     }
 }

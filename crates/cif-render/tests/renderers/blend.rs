@@ -239,7 +239,8 @@ struct Expected {
 fn expected(
     config: &SyntheticConfig,
     settings: RenderSettings,
-    (channels, blending): (usize, Blending),
+    channels: usize,
+    blending: Blending,
     paths: &[GeometryPath],
     edit: impl Fn(&mut SyntheticScene),
 ) -> Expected {
@@ -319,7 +320,7 @@ fn check_fast_path(
     edit: &dyn Fn(&mut SyntheticScene),
 ) {
     for blending in BOTH {
-        let expected = expected(config, settings, (channels, blending), &PATHS, edit);
+        let expected = expected(config, settings, channels, blending, &PATHS, edit);
         let (head, field) = (&expected.head, &expected.scene.field);
         let (values, v_blended) = (single(&head.values), single(&head.v_blended));
         let request = head.request(&values);
@@ -587,7 +588,7 @@ mod gpu {
     ) {
         let Some(mut device) = device() else { return };
         for blending in BOTH {
-            let expected = expected(config, settings, (channels, blending), &PATHS, edit);
+            let expected = expected(config, settings, channels, blending, &PATHS, edit);
             let mut mismatches = Mismatches::default();
             let frozen = run(&mut device, &expected, &settings, &[None]).expect("the view is drawn");
             expected.compare_image(&frozen.blended, 3e-5, &mut mismatches);
@@ -619,7 +620,7 @@ mod gpu {
     fn gradients_add_up_and_two_runs_give_the_same_bits() {
         let Some(mut device) = device() else { return };
         let config = SyntheticConfig { gaussians: 3000, screen_size: (0.01, 0.03), ..views::config() };
-        let expected = expected(&config, settings(), (6, Blending::Color), &[], |_| {});
+        let expected = expected(&config, settings(), 6, Blending::Color, &[], |_| {});
         let both = [None, Some(GeometryPath::Full)];
         let twice = run(&mut device, &expected, &settings(), &both).unwrap();
         assert!(run(&mut device, &expected, &settings(), &both).unwrap() == twice);
@@ -635,7 +636,7 @@ mod gpu {
     fn views_without_gaussians() {
         let Some(mut device) = device() else { return };
         let config = SyntheticConfig { gaussians: 0, instances: 0, ..views::config() };
-        let expected = expected(&config, settings(), (5, Blending::Color), &[], |_| {});
+        let expected = expected(&config, settings(), 5, Blending::Color, &[], |_| {});
         let settings = RenderSettings { instances: None, ..settings() };
         let outcome = run(&mut device, &expected, &settings, &[Some(GeometryPath::Full)]).unwrap();
         assert!(outcome.v_values.is_empty() && outcome.blended == vec![0.0; 5 * 71 * 53]);
@@ -679,8 +680,8 @@ fn contributors_of_pixels_have_the_weights_that_blending_gives_them() {
         let mut renderer = Renderer::new(level);
         let count = |renderer: &mut Renderer, rule: ContributorRule| {
             let mut counts = IdentityCounts::zeros(n, k);
-            let of = (&labels, &rule);
-            renderer.count_contributors(&scene.field, &scene.camera, 0.3, &settings, of, &mut counts);
+            renderer.prepare(&scene.field, &scene.camera, 0.3, &settings);
+            renderer.count_contributors(&labels, &rule, &mut counts);
             counts
         };
         let agree = |counts: &IdentityCounts, sums: &[f32]| {

@@ -8,7 +8,7 @@ use cif_field::parameters::{
     QUATERNIONS, SH_COEFFICIENTS,
 };
 use cif_render::synthetic::SyntheticScene;
-use cif_render::wgpu::deform::fixed_sum;
+use cif_render::wgpu::deform::{DeformedGaussians, fixed_sum};
 use cif_render::wgpu::poses::pose;
 use cif_render::wgpu::{
     Commands, DeformationGradients, DeviceIdentities, Gpu, GpuDeformation, GpuError, GpuGaussians, GpuPoses,
@@ -88,8 +88,8 @@ pub(crate) fn run(
     let faults = GpuVec::<u32>::zeros(gpu, "faults", 4)?;
     let input = ViewInput { camera: &scene.camera, settings, labels };
     let mut commands = Commands::new(gpu, None);
-    let motion = (deformation.as_ref().map(|(deformation, _)| deformation), groups.as_ref());
-    let moved = pose(gpu, &mut commands, scene.time, motion, &gaussians, &posed);
+    let moving = deformation.as_ref().map(|(deformation, _)| deformation);
+    let moved = pose(gpu, &mut commands, scene.time, moving, groups.as_ref(), &gaussians, &posed);
     rasterizer.project(gpu, &mut commands, moved, identities.as_ref(), &input)?;
     rasterizer.measure(gpu, commands)?;
     let mut splats = rasterizer.splats().read(gpu)?;
@@ -105,8 +105,9 @@ pub(crate) fn run(
         groups.backward(gpu, &mut commands, &gaussians, rasterizer, &faults);
     }
     if let Some((deformation, gradients)) = &mut deformation {
-        let (at, v_posed) = ((&*deformation, scene.time), &rasterizer.gradients().gaussians);
-        gradients.backward(gpu, &mut commands, at, &gaussians, v_posed, &v_canonical, &faults);
+        let v_posed = &rasterizer.gradients().gaussians;
+        let both = DeformedGaussians { canonical: &gaussians, v_posed, v_canonical: &v_canonical };
+        gradients.backward(gpu, &mut commands, deformation, scene.time, both, &faults);
     }
     let counts = rasterizer.read_statistics(gpu, &mut commands);
     commands.submit();

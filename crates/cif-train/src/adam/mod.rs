@@ -112,7 +112,7 @@ impl Moments {
         rates: RowRates,
         visible: Option<&[f32]>,
     ) -> Result<(), NotFinite> {
-        self.step_with(parameters, gradients, (rates, EPSILON), visible)
+        self.step_with(parameters, gradients, rates, EPSILON, visible)
     }
 
     /// As [`Self::step`], with an epsilon of its own.
@@ -126,13 +126,14 @@ impl Moments {
         &mut self,
         parameters: &mut [f32],
         gradients: &mut [f32],
-        (rates, epsilon): (RowRates, f32),
+        rates: RowRates,
+        epsilon: f32,
         visible: Option<&[f32]>,
     ) -> Result<(), NotFinite> {
         assert_eq!(parameters.len(), self.first.len(), "parameters and moments differ in length");
         assert_eq!(gradients.len(), self.first.len(), "gradients and moments differ in length");
         self.steps += 1;
-        let bias = (BiasCorrection::after(self.steps), epsilon);
+        let bias = BiasCorrection::after(self.steps);
         let level = Level::new();
         let width = self.width.max(1);
         let chunk_rows = (CHUNK / width).max(1);
@@ -144,7 +145,8 @@ impl Moments {
             .enumerate()
             .map(|(chunk, (((p, g), m), v))| {
                 let visible = visible.map(|visible| &visible[chunk * chunk_rows..]);
-                dispatch!(level, _simd => step_rows((p, g, m, v), width, rates, visible, bias))
+                let rows = RowSlices { parameters: p, gradients: g, first: m, second: v, width };
+                dispatch!(level, _simd => step_rows(rows, rates, visible, bias, epsilon))
             })
             .reduce(|| Ok(()), Result::and)
     }
@@ -207,21 +209,35 @@ impl RowRates {
     }
 }
 
-/// A step of some rows: parameters, gradients, first and second moments. With `visible`, only rows with a positive entry
-/// there change.
+/// Some rows of a parameter group, `[rows, width]` each.
+struct RowSlices<'a> {
+    /// Values.
+    parameters: &'a mut [f32],
+    /// Gradients, which become zero.
+    gradients: &'a mut [f32],
+    /// First moments.
+    first: &'a mut [f32],
+    /// Second moments.
+    second: &'a mut [f32],
+    /// Floats per row.
+    width: usize,
+}
+
+/// A step of some rows. With `visible`, only rows with a positive entry there change.
 #[inline(always)]
 fn step_rows(
-    (p, g, m, v): (&mut [f32], &mut [f32], &mut [f32], &mut [f32]),
-    width: usize,
+    rows: RowSlices<'_>,
     rates: RowRates,
     visible: Option<&[f32]>,
-    bias: (BiasCorrection, f32),
+    bias: BiasCorrection,
+    epsilon: f32,
 ) -> Result<(), NotFinite> {
+    let RowSlices { parameters: p, gradients: g, first: m, second: v, width } = rows;
     if !all_finite(g) {
         return Err(NotFinite);
     }
     match rates {
-        RowRates::Uniform(rate) if visible.is_none() => update(p, g, m, v, rate, bias),
+        RowRates::Uniform(rate) if visible.is_none() => update(p, g, m, v, rate, bias, epsilon),
         _ => {
             let pattern = rates.pattern();
             let rows = p.chunks_mut(width).zip(g.chunks(width));
@@ -231,14 +247,14 @@ fn step_rows(
                     continue;
                 }
                 match rates {
-                    RowRates::Uniform(rate) => update(p, g, m, v, rate, bias),
+                    RowRates::Uniform(rate) => update(p, g, m, v, rate, bias, epsilon),
                     RowRates::Split { active, .. } => {
                         // Whole vectors: what is left over would go float by float.
                         let n = active.next_multiple_of(LANES).min(width);
                         let (p, g, m, v) = (&mut p[..n], &g[..n], &mut m[..n], &mut v[..n]);
                         match active < n {
-                            true => update_with_rates::<true>(p, g, m, v, &pattern[..n], bias),
-                            false => update_with_rates::<false>(p, g, m, v, &pattern[..n], bias),
+                            true => update_with_rates::<true>(p, g, m, v, &pattern[..n], bias, epsilon),
+                            false => update_with_rates::<false>(p, g, m, v, &pattern[..n], bias, epsilon),
                         }
                     }
                 }
@@ -271,7 +287,7 @@ const LANES: usize = 16;
 
 /// The step of one float. Below the smallest normal second moment the ratio would be noise: no step (row 25).
 #[inline(always)]
-fn move_by(p: &mut f32, g: f32, m: &mut f32, v: &mut f32, rate: f32, (second, epsilon): (f32, f32)) {
+fn move_by(p: &mut f32, g: f32, m: &mut f32, v: &mut f32, rate: f32, second: f32, epsilon: f32) {
     *m = BETA_1 * *m + (1.0 - BETA_1) * g;
     *v = BETA_2 * *v + (1.0 - BETA_2) * g * g;
     let step = rate * *m / (v.sqrt() * second + epsilon);
@@ -285,11 +301,12 @@ fn update(
     m: &mut [f32],
     v: &mut [f32],
     rate: f32,
-    (bias, epsilon): (BiasCorrection, f32),
+    bias: BiasCorrection,
+    epsilon: f32,
 ) {
     let rate = rate * bias.first;
     for (((p, g), m), v) in p.iter_mut().zip(g).zip(m.iter_mut()).zip(v.iter_mut()) {
-        move_by(p, *g, m, v, rate, (bias.second, epsilon));
+        move_by(p, *g, m, v, rate, bias.second, epsilon);
     }
 }
 
@@ -301,11 +318,12 @@ fn update_with_rates<const STAY: bool>(
     m: &mut [f32],
     v: &mut [f32],
     rates: &[f32],
-    (bias, epsilon): (BiasCorrection, f32),
+    bias: BiasCorrection,
+    epsilon: f32,
 ) {
     for ((((p, g), m), v), rate) in p.iter_mut().zip(g).zip(m.iter_mut()).zip(v.iter_mut()).zip(rates) {
         let before = (*m, *v);
-        move_by(p, *g, m, v, rate * bias.first, (bias.second, epsilon));
+        move_by(p, *g, m, v, rate * bias.first, bias.second, epsilon);
         if STAY {
             (*m, *v) = if *rate > 0.0 { (*m, *v) } else { before };
         }

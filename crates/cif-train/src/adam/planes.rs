@@ -184,7 +184,8 @@ fn sweep(band: Band<'_>, rate: f32, bias: BiasCorrection) -> Result<(), NotFinit
             &mut band.first[range.clone()],
             &mut band.second[range.clone()],
             rate,
-            (bias, EPSILON),
+            bias,
+            EPSILON,
         );
         gradient.fill(0.0);
     }

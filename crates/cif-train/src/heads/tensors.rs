@@ -151,7 +151,7 @@ impl HeadTensors {
                 gradients.fill(0.0);
                 continue;
             }
-            let finite = moments.step_with(values, gradients, (RowRates::Uniform(rate), epsilon), None);
+            let finite = moments.step_with(values, gradients, RowRates::Uniform(rate), epsilon, None);
             debug_assert!(finite.is_ok(), "gradients were looked at");
         }
     }

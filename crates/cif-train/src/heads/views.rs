@@ -65,8 +65,8 @@ impl<'a> TrainingViews<'a> {
         let (field, settings) = (self.field, self.settings);
         let mut counts = IdentityCounts::zeros(field.len(), field.instances.len());
         self.each_masked(&|_| true, &mut |renderer, frame, labels| {
-            let counted = (labels, rule);
-            renderer.count_contributors(field, &frame.camera, frame.time, &settings, counted, &mut counts);
+            renderer.prepare(field, &frame.camera, frame.time, &settings);
+            renderer.count_contributors(labels, rule, &mut counts);
         })?;
         Ok(counts)
     }
@@ -85,8 +85,8 @@ impl<'a> TrainingViews<'a> {
         self.each_masked(&|_| true, &mut |renderer, frame, masks| {
             let mut counts = IdentityCounts::zeros(field.len(), field.instances.len() + 1);
             let shifted = masks.map(|label| label + 1);
-            let counted = (&shifted, rule);
-            renderer.count_contributors(field, &frame.camera, frame.time, &settings, counted, &mut counts);
+            renderer.prepare(field, &frame.camera, frame.time, &settings);
+            renderer.count_contributors(&shifted, rule, &mut counts);
             each(&counts);
         })
     }

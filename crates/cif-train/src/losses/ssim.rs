@@ -41,6 +41,15 @@ pub struct SsimScratch {
     maps: [Vec<Vector>; 3],
 }
 
+/// A view beside its target, `[height, width, 3]` each.
+#[derive(Clone, Copy)]
+struct Compared<'a> {
+    /// Colours of the view, in [0, 1] where they are in range.
+    rendered: &'a [f32],
+    /// Those of the frame, 8 bits.
+    target: &'a [u8],
+}
+
 /// Memory of one band at work, for some maps at once.
 struct Band<const MAPS: usize> {
     /// Values of a row.
@@ -169,13 +178,15 @@ impl SsimScratch {
         weight: f32,
         v_color: &mut PixelGrid<[f32; CHANNELS]>,
     ) -> f64 {
-        let (x, y) = (rendered.pixels.as_flattened(), target.pixels.as_flattened());
+        let compared =
+            Compared { rendered: rendered.pixels.as_flattened(), target: target.pixels.as_flattened() };
+        let values = compared.rendered.len();
         let length = (rendered.width as usize).max(1) * CHANNELS;
         let vectors = length.div_ceil(LANES);
         for map in &mut self.maps {
-            map.resize(x.len() / length * vectors, Vector([0.0; LANES]));
+            map.resize(values / length * vectors, Vector([0.0; LANES]));
         }
-        let v = (f64::from(weight) / x.len().max(1) as f64) as f32;
+        let v = (f64::from(weight) / values.max(1) as f64) as f32;
         let level = Level::new();
         let [d, e, f] = &mut self.maps;
         let size = BAND * vectors;
@@ -188,7 +199,7 @@ impl SsimScratch {
             .map_init(
                 || Band::new(length),
                 |band, (index, ((d, e), f))| {
-                    dispatch!(level, simd => similarity(simd, band, (x, y), index * BAND, v, [&mut *d, &mut *e, &mut *f]))
+                    dispatch!(level, simd => similarity(simd, band, compared, index * BAND, v, [&mut *d, &mut *e, &mut *f]))
                 },
             )
             .collect();
@@ -196,10 +207,10 @@ impl SsimScratch {
         v_color.pixels.as_flattened_mut().par_chunks_mut(BAND * length).enumerate().for_each_init(
             || Band::new(length),
             |band, (index, v_color)| {
-                dispatch!(level, simd => add_blurred(simd, band, maps, (x, y), index * BAND, v_color));
+                dispatch!(level, simd => add_blurred(simd, band, maps, compared, index * BAND, v_color));
             },
         );
-        sums.iter().sum::<f64>() / x.len().max(1) as f64
+        sums.iter().sum::<f64>() / values.max(1) as f64
     }
 }
 
@@ -208,11 +219,12 @@ impl SsimScratch {
 fn similarity<S: Simd>(
     simd: S,
     band: &mut Band<5>,
-    (x, y): (&[f32], &[u8]),
+    compared: Compared<'_>,
     start: usize,
     v: f32,
     [d, e, f]: [&mut [Vector]; 3],
 ) -> f64 {
+    let Compared { rendered: x, target: y } = compared;
     let length = band.length;
     let (height, rows) = (x.len() / length, d.len() / band.vectors);
     let mut sum = 0.0;
@@ -269,10 +281,11 @@ fn add_blurred<S: Simd>(
     simd: S,
     band: &mut Band<3>,
     maps: &[Vec<Vector>; 3],
-    (x, y): (&[f32], &[u8]),
+    compared: Compared<'_>,
     start: usize,
     v_color: &mut [f32],
 ) {
+    let Compared { rendered: x, target: y } = compared;
     let (length, vectors) = (band.length, band.vectors);
     let (height, rows) = (x.len() / length, v_color.len() / length);
     for around in 0..rows + 2 * RADIUS {

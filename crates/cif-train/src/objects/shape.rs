@@ -4,7 +4,7 @@ use cif_field::tracks::TrackPose;
 use cif_field::{Field, Gaussians, Record, SortMetric, Timeline, Tracks};
 use cif_geometry::{PinholeCamera, PixelGrid, RigidTransform};
 use cif_render::cpu::{Renderer, SimdLevel};
-use cif_render::{Gradients, PoseGradient, RenderSettings};
+use cif_render::{Gradients, GroupedGaussian, PoseGradient, RenderSettings};
 use glam::{DMat3, DQuat, DVec3};
 
 use super::view::Crop;
@@ -248,8 +248,9 @@ impl Shape {
             self.renderer.backward_with_alpha(&self.field, &v_color, &v_alpha, &mut self.gradients);
             let (g, v) = (&self.field.gaussians, &self.gradients.gaussians);
             for row in 0..self.len() {
-                let at = (g.means[row], g.quaternions[row], &g.sh_coefficients[row]);
-                sum.add(at, (v.means[row], v.quaternions[row], None));
+                let (offset, quaternion, sh) = (g.means[row], g.quaternions[row], &g.sh_coefficients[row]);
+                let gaussian = GroupedGaussian { offset, quaternion, sh };
+                sum.add(&gaussian, v.means[row], v.quaternions[row], None);
             }
             sum = PoseGradient { turn: rotation * sum.turn, translation: rotation * sum.translation };
         }

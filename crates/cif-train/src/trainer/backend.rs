@@ -102,7 +102,6 @@ mod on_gpu {
         /// kernel.
         pub fn use_gpu(&mut self, gpu: &Gpu) -> Result<(), TrainError> {
             let state = &self.state;
-            let capture = (&state.dataset, &state.config);
             let fresh = match &state.field.deformation {
                 None if self.stages.is_dynamic => {
                     Some(initialize::initial_deformation(&state.dataset, &state.config)?)
@@ -110,7 +109,8 @@ mod on_gpu {
                 _ => None,
             };
             let deformation = state.field.deformation.as_ref().or(fresh.as_ref());
-            let engine = GpuEngine::new(gpu, capture, state.field.gaussians.len(), deformation)?;
+            let (dataset, config) = (&state.dataset, &state.config);
+            let engine = GpuEngine::new(gpu, dataset, config, state.field.gaussians.len(), deformation)?;
             self.engine = Box::new(engine);
             Ok(())
         }

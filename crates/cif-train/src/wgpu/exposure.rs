@@ -48,6 +48,19 @@ impl CameraExposures {
     }
 }
 
+/// A view that a camera records with its exposure.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct ExposedView<'a> {
+    /// Exposures of all cameras.
+    pub(crate) cameras: &'a CameraExposures,
+    /// Row of the camera among them.
+    pub(crate) camera: u32,
+    /// Colours as the renderer leaves them, `[pixels]`.
+    pub(crate) colors: &'a GpuVec<[f32; 4]>,
+    /// Pixels of the view.
+    pub(crate) pixels: usize,
+}
+
 /// Recorded around the losses of a view, and after the last view of a step.
 #[derive(Debug)]
 pub(crate) struct GpuExposure {
@@ -82,7 +95,7 @@ impl GpuExposure {
         })
     }
 
-    /// Records what camera number `camera` makes of `colors`: [`Self::recorded`]. One view per submission: its
+    /// Records what the camera makes of the colours: [`Self::recorded`]. One view per submission: its
     /// settings are written at once.
     ///
     /// # Errors
@@ -91,34 +104,33 @@ impl GpuExposure {
         &mut self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        (cameras, camera): (&CameraExposures, u32),
-        (colors, pixels): (&GpuVec<[f32; 4]>, usize),
+        view: ExposedView<'_>,
         v_colors: &GpuVec<[f32; 4]>,
         faults: &GpuVec<u32>,
     ) -> Result<(), GpuError> {
+        let ExposedView { camera, pixels, .. } = view;
         self.recorded.resize(gpu, pixels)?;
         self.partial_sums.resize(gpu, 2 * pixels.div_ceil(WORKGROUP))?;
         self.settings.write(gpu, &ExposureSettings { pixels: pixels as u32, camera, ..Default::default() });
-        let group = self.bind(gpu, &self.expose, cameras, colors, v_colors, faults);
+        let group = self.bind(gpu, &self.expose, view, v_colors, faults);
         commands.stage("exposure", |stage| {
             stage.dispatch(&self.expose, &group, workgroups(pixels, WORKGROUP));
         });
         Ok(())
     }
 
-    /// Records the way back: `v_colors`, by the recorded colours, become those by `colors`, and the camera gets its
+    /// Records the way back: `v_colors`, by the recorded colours, become those by the colours of the view, and the camera gets its
     /// gradient. To be recorded after [`Self::expose`] of the same view.
     pub(crate) fn pull_back(
         &self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        cameras: &CameraExposures,
-        colors: &GpuVec<[f32; 4]>,
+        view: ExposedView<'_>,
         v_colors: &GpuVec<[f32; 4]>,
         faults: &GpuVec<u32>,
     ) {
-        let pull_back = self.bind(gpu, &self.pull_back, cameras, colors, v_colors, faults);
-        let add_gradient = self.bind(gpu, &self.add_gradient, cameras, colors, v_colors, faults);
+        let pull_back = self.bind(gpu, &self.pull_back, view, v_colors, faults);
+        let add_gradient = self.bind(gpu, &self.add_gradient, view, v_colors, faults);
         commands.stage("exposure", |stage| {
             stage.dispatch(&self.pull_back, &pull_back, workgroups(self.recorded.len(), WORKGROUP));
             stage.dispatch(&self.add_gradient, &add_gradient, [1, 1, 1]);
@@ -158,8 +170,7 @@ impl GpuExposure {
         &self,
         gpu: &Gpu,
         kernel: &Kernel,
-        cameras: &CameraExposures,
-        colors: &GpuVec<[f32; 4]>,
+        view: ExposedView<'_>,
         v_colors: &GpuVec<[f32; 4]>,
         faults: &GpuVec<u32>,
     ) -> BindGroup {
@@ -167,12 +178,12 @@ impl GpuExposure {
             gpu,
             &[
                 self.settings.binding(),
-                cameras.values.binding(),
-                colors.binding(),
+                view.cameras.values.binding(),
+                view.colors.binding(),
                 self.recorded.binding(),
                 v_colors.binding(),
                 self.partial_sums.binding(),
-                cameras.gradients.binding(),
+                view.cameras.gradients.binding(),
                 faults.binding(),
             ],
         )

@@ -26,7 +26,8 @@ impl GpuJudge {
         gpu: &Gpu,
         commands: &mut Commands<'_>,
         judgement: Judgement,
-        (results, counts): (&GpuVec<[f32; 4]>, &GpuVec<u32>),
+        results: &GpuVec<[f32; 4]>,
+        counts: &GpuVec<u32>,
         faults: &GpuVec<u32>,
     ) {
         self.judgement.write(gpu, &judgement);

@@ -52,6 +52,15 @@ impl GpuTarget {
     }
 }
 
+/// Pixels of a view that was drawn, `[pixels]` each.
+#[derive(Clone, Copy, Debug)]
+pub struct DrawnPixels<'a> {
+    /// Colours, as the renderer leaves them or as the camera records them.
+    pub colors: &'a GpuVec<[f32; 4]>,
+    /// Blended values of the instance pass, as the renderer leaves them.
+    pub blended: &'a GpuVec<[f32; 4]>,
+}
+
 /// Weights and switches of the losses of a view.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct LossWeights {
@@ -126,8 +135,7 @@ impl GpuLosses {
         &self.results
     }
 
-    /// Records the losses of a view, its `colors` and `blended` values as the renderer leaves them; results go to
-    /// `slot`. One view per submission: its settings are written at once.
+    /// Records the losses of a view; results go to `slot`. One view per submission: its settings are written at once.
     ///
     /// # Errors
     /// When the view exceeds what the device binds.
@@ -138,7 +146,7 @@ impl GpuLosses {
         &mut self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        (colors, blended): (&GpuVec<[f32; 4]>, &GpuVec<[f32; 4]>),
+        drawn: DrawnPixels<'_>,
         target: &GpuTarget,
         weights: &LossWeights,
         slot: usize,
@@ -178,8 +186,8 @@ impl GpuLosses {
         // Kernels of one file share its bindings.
         let bindings = [
             self.settings.binding(),
-            colors.binding(),
-            blended.binding(),
+            drawn.colors.binding(),
+            drawn.blended.binding(),
             target.colors.binding(),
             target.labels.binding(),
             self.v_colors.binding(),
@@ -193,7 +201,7 @@ impl GpuLosses {
                 gpu,
                 &[
                     self.settings.binding(),
-                    colors.binding(),
+                    drawn.colors.binding(),
                     target.colors.binding(),
                     self.rows.binding(),
                     self.maps.binding(),

@@ -1,9 +1,10 @@
 //! Holding Gaussians to known motion, on the device.
 
+use cif_render::wgpu::deform::DeformedGaussians;
 use cif_render::wgpu::{Commands, Gpu, GpuError, GpuGaussians, GpuVec, Kernel, Uniform, workgroups};
-use glam::DVec3;
 
 use super::kernels::{DISPLACEMENT, Motion, entries};
+use crate::guidance::Pulls;
 use crate::losses::displacement::Pull;
 
 /// Floats of a guide on the device: three vectors of 16 bytes, and a matrix of three such columns.
@@ -45,20 +46,23 @@ impl GpuMotion {
         Ok(())
     }
 
-    /// Records the gradients by what the deformation adds to the centres: `v_posed` gets them, and `v_canonical`
-    /// loses what the direct path will add. `shifts` are those of the objects at the time of the view, metres.
-    /// One time per submission: it is written at once.
+    /// Records the gradients by what the deformation adds to the centres, `posed` at the time of the view: `v_posed` gets
+    /// them, and `v_canonical` loses what the direct path will add. `extent` is that of the scene, metres. One time per
+    /// submission: it is written at once.
     ///
     /// # Errors
     /// When the objects exceed what the device binds.
-    pub fn record(
+    pub(crate) fn record(
         &mut self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        (shifts, [path, place], extent): (&[DVec3], [Pull; 2], f64),
-        (posed, canonical): (&GpuGaussians, &GpuGaussians),
-        (v_posed, v_canonical): (&GpuGaussians, &GpuGaussians),
+        pulls: &Pulls,
+        extent: f64,
+        posed: &GpuGaussians,
+        gaussians: DeformedGaussians<'_>,
     ) -> Result<(), GpuError> {
+        let Pulls { shifts, strengths: [path, place] } = pulls;
+        let DeformedGaussians { canonical, v_posed, v_canonical } = gaussians;
         let n = canonical.len();
         if self.guide_of.len() != n || n == 0 {
             return Ok(());
@@ -71,8 +75,8 @@ impl GpuMotion {
         self.motion.write(
             gpu,
             &Motion {
-                path: pull(path),
-                place: pull(place),
+                path: pull(*path),
+                place: pull(*place),
                 scale: (1.0 / (n as f64 * extent)) as f32,
                 gaussians: n as u32,
                 unused: [0.0; 2],

@@ -2,7 +2,7 @@
 
 use cif_field::DeformationConfig;
 use cif_field::gaussians::SH_FLOATS;
-use cif_field::parameters::{LOG_CALIBRATIONS, Parameter, SH_COEFFICIENTS};
+use cif_field::parameters::{LOG_CALIBRATIONS, MLP, PLANES, Parameter, SH_COEFFICIENTS};
 use cif_render::wgpu::deform::{DeformationGradients, SPLITS};
 use cif_render::wgpu::gaussians::COLUMNS;
 use cif_render::wgpu::{
@@ -66,9 +66,11 @@ impl GroupSteps {
     }
 }
 
-/// Settings of the step of the Gaussians, beside their rates.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct GaussianStep {
+/// Step of the Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GaussianStep<'a> {
+    /// Steps of their parameters.
+    pub groups: &'a GroupSteps,
     /// Only visible rows move.
     pub visible_only: bool,
     /// Raw quaternions become unit ones.
@@ -77,17 +79,17 @@ pub struct GaussianStep {
     pub occupancy_limits: Option<[f32; 2]>,
 }
 
-impl GaussianStep {
-    fn rates(&self, groups: &GroupSteps, gaussians: usize) -> GaussianRates {
+impl GaussianStep<'_> {
+    fn rates(&self, gaussians: usize) -> GaussianRates {
         let mut rates = GaussianRates::default();
         for (parameter, first) in COLUMNS {
-            let (rate, second) = groups.of(&parameter).corrected();
+            let (rate, second) = self.groups.of(&parameter).corrected();
             for k in first..first + parameter.width() {
                 rates.geometry[k / 4][k % 4] = rate;
                 rates.geometry_second[k / 4][k % 4] = second;
             }
         }
-        let sh = groups.of(&SH_COEFFICIENTS);
+        let sh = self.groups.of(&SH_COEFFICIENTS);
         let (sh_base, sh_second) = sh.corrected();
         let (rest, sh_active) = match sh.rates {
             RowRates::Uniform(rate) => (rate, SH_FLOATS),
@@ -129,6 +131,17 @@ impl GpuMoments {
             second: GpuVec::from_slice(gpu, label, second)?,
         })
     }
+}
+
+/// Parameters that a step moves, with the sums of their gradients and their moments, each in a layout of the group.
+#[derive(Debug)]
+pub struct Optimised<'a, P, G, M> {
+    /// Values.
+    pub parameters: &'a P,
+    /// Gradients of the step, which become zero.
+    pub gradients: &'a G,
+    /// First and second moments.
+    pub moments: &'a M,
 }
 
 /// The optimiser's kernels, and those that add up a step.
@@ -231,7 +244,8 @@ impl GpuOptimiser {
         &self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        (view, total): (&GpuVec<f32>, &GpuVec<f32>),
+        view: &GpuVec<f32>,
+        total: &GpuVec<f32>,
         faults: &GpuVec<u32>,
     ) {
         let count = self.count(gpu, Count::Calibrations, total.len());
@@ -245,7 +259,8 @@ impl GpuOptimiser {
         &self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        (view, total): (&GpuVec<[f32; 4]>, &GpuVec<[f32; 4]>),
+        view: &GpuVec<[f32; 4]>,
+        total: &GpuVec<[f32; 4]>,
         faults: &GpuVec<u32>,
     ) {
         let count = self.count(gpu, Count::Screen, 4 * total.len());
@@ -259,7 +274,8 @@ impl GpuOptimiser {
         &self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        (screen, statistics): (&GpuVec<[f32; 4]>, &GpuVec<[f32; 4]>),
+        screen: &GpuVec<[f32; 4]>,
+        statistics: &GpuVec<[f32; 4]>,
         faults: &GpuVec<u32>,
     ) {
         let count = self.count(gpu, Count::Statistics, 4 * statistics.len());
@@ -276,7 +292,8 @@ impl GpuOptimiser {
         gpu: &Gpu,
         commands: &mut Commands<'_>,
         row_offsets: &GpuVec<u32>,
-        (log_estimates, log_calibrations): (&GpuVec<f32>, &GpuVec<f32>),
+        log_estimates: &GpuVec<f32>,
+        log_calibrations: &GpuVec<f32>,
         identities: &GpuVec<[u32; 2]>,
     ) {
         let rows = row_offsets.len().saturating_sub(1);
@@ -295,20 +312,19 @@ impl GpuOptimiser {
     }
 
     /// Records the step of all Gaussians; gradients become zero. While the second word of `faults` makes steps wait,
-    /// nothing moves here and in the steps of the other groups. `moments` are the first and the second.
+    /// nothing moves here and in the steps of the other groups. Moments are the first and the second.
     pub fn step_gaussians(
         &self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        (step, groups): (&GaussianStep, &GroupSteps),
-        (parameters, gradients): (&GpuGaussians, &GpuGaussians),
-        moments: &[GpuGaussians; 2],
+        step: &GaussianStep<'_>,
+        gaussians: &Optimised<'_, GpuGaussians, GpuGaussians, [GpuGaussians; 2]>,
         screen: &GpuVec<[f32; 4]>,
         faults: &GpuVec<u32>,
     ) {
+        let Optimised { parameters, gradients, moments: [first, second] } = *gaussians;
         let n = parameters.len();
-        self.gaussian_rates.write(gpu, &step.rates(groups, n));
-        let [first, second] = moments;
+        self.gaussian_rates.write(gpu, &step.rates(n));
         let geometry = self.geometry.bind(
             gpu,
             &[
@@ -344,11 +360,12 @@ impl GpuOptimiser {
         &self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        (step, limit): (GroupStep, f32),
-        (parameters, gradients): (&GpuVec<f32>, &GpuVec<f32>),
-        moments: &GpuMoments,
+        step: GroupStep,
+        limit: f32,
+        calibrations: &Optimised<'_, GpuVec<f32>, GpuVec<f32>, GpuMoments>,
         faults: &GpuVec<u32>,
     ) {
+        let Optimised { parameters, gradients, moments } = *calibrations;
         let (rate, second) = step.corrected();
         let floats = parameters.len();
         self.calibration_rates.write(
@@ -369,7 +386,7 @@ impl GpuOptimiser {
         commands.stage("optimiser: Gaussians", |s| s.dispatch(&self.network, &group, workgroups(floats, 64)));
     }
 
-    /// Records the step of planes and network; `moments` are those of the planes and of the network.
+    /// Records the step of planes and network; moments are those of the planes and of the network.
     ///
     /// # Errors
     /// When the device cannot hold the table of planes.
@@ -377,16 +394,16 @@ impl GpuOptimiser {
         &mut self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        (planes, mlp): (GroupStep, GroupStep),
+        groups: &GroupSteps,
         weights: &PlaneWeights,
-        (deformation, gradients): (&GpuDeformation, &DeformationGradients),
-        moments: &[GpuMoments; 2],
+        deformation: &Optimised<'_, GpuDeformation, DeformationGradients, [GpuMoments; 2]>,
         faults: &GpuVec<u32>,
     ) -> Result<(), GpuError> {
-        let (rates, places) = plane_rates(deformation.config(), weights, planes);
+        let Optimised { parameters: deformation, gradients, moments: [of_planes, of_network] } = *deformation;
+        let (rates, places) = plane_rates(deformation.config(), weights, groups.of(&PLANES));
         self.plane_rates.write(gpu, &rates);
         self.plane_places.replace(gpu, &places)?;
-        let (rate, second) = mlp.corrected();
+        let (rate, second) = groups.of(&MLP).corrected();
         let floats = deformation.mlp.len();
         self.network_rates.write(
             gpu,
@@ -399,7 +416,6 @@ impl GpuOptimiser {
                 ..GroupRates::default()
             },
         );
-        let [of_planes, of_network] = moments;
         let planes = self.planes.bind(
             gpu,
             &[

@@ -54,7 +54,8 @@ impl GpuPoseOptimiser {
         gpu: &Gpu,
         commands: &mut Commands<'_>,
         rate: f64,
-        (groups, canonical): (&GpuPoses, &GpuGaussians),
+        groups: &GpuPoses,
+        canonical: &GpuGaussians,
         faults: &GpuVec<u32>,
     ) {
         self.rates.write(gpu, &PoseRates { rate: rate as f32, ..PoseRates::default() });

@@ -4,12 +4,12 @@ use cif_field::gaussians::SH_FLOATS;
 use cif_field::{DeformationConfig, Gaussians, Heads, TimeEncoding};
 use cif_geometry::PixelGrid;
 use cif_render::Gradients;
-use cif_render::wgpu::deform::{DeformationGradients, FIXED_UNITS, SPLITS, ZERO_SUM};
+use cif_render::wgpu::deform::{DeformationGradients, DeformedGaussians, FIXED_UNITS, SPLITS, ZERO_SUM};
 use cif_render::wgpu::gaussians::{gaussians, geometry};
 use cif_render::wgpu::validation::validate;
 use cif_render::wgpu::{Commands, Gpu, GpuDeformation, GpuGaussians, GpuStatistics, GpuVec, Layout, testing};
 
-use super::exposure::{CameraExposures, GpuExposure};
+use super::exposure::{CameraExposures, ExposedView, GpuExposure};
 use super::judge::GpuJudge;
 use cif_field::parameters::{
     LOG_CALIBRATIONS, LOG_SCALES, MEANS, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, Parameter,
@@ -18,12 +18,13 @@ use cif_field::parameters::{
 use cif_render::wgpu::faults::bit;
 
 use super::kernels::{Judgement, LAYOUTS, MODULES, fault, fault_name};
-use super::losses::{GpuLosses, GpuTarget, LossWeights, ViewLoss};
+use super::losses::{DrawnPixels, GpuLosses, GpuTarget, LossWeights, ViewLoss};
 use super::motion::GpuMotion;
-use super::optimiser::{GaussianStep, GpuMoments, GpuOptimiser, GroupStep, GroupSteps};
+use super::optimiser::{GaussianStep, GpuMoments, GpuOptimiser, GroupStep, GroupSteps, Optimised};
 use crate::adam::{Moments, PlaneWeights, RowRates, step_planes};
 use crate::density::DensifyStatistics;
 use crate::exposure::{Exposures, RATES, WIDTH};
+use crate::guidance::Pulls;
 use crate::losses::displacement::{Pose, Pull, displacement_loss, rotations};
 use crate::losses::{SsimScratch, color_loss};
 
@@ -99,17 +100,18 @@ fn colour_losses_on(gpu: Gpu) {
     let on_device = GpuTarget::new(&gpu, &target, None).unwrap();
     let colors = GpuVec::from_slice(&gpu, "colors", &four(&rendered.pixels)).unwrap();
     let blended = GpuVec::<[f32; 4]>::zeros(&gpu, "blended", pixels).unwrap();
+    let drawn = DrawnPixels { colors: &colors, blended: &blended };
     for (slot, lambda_dssim) in [(0, 0.0), (63, 0.2), (7, 1.0)] {
         let mut v = PixelGrid::filled(0, 0, [0.0; 3]);
         let mut scratch = SsimScratch::default();
         let expected = color_loss(&rendered, &target, lambda_dssim, 0.5, &mut v, &mut scratch);
         let weights = LossWeights { lambda_dssim, view: 0.5, ..LossWeights::default() };
         let mut commands = Commands::new(&gpu, None);
-        losses.record(&gpu, &mut commands, (&colors, &blended), &on_device, &weights, slot).unwrap();
+        losses.record(&gpu, &mut commands, drawn, &on_device, &weights, slot).unwrap();
         commands.submit();
         let slots = losses.results().read(&gpu).unwrap();
         let mut commands = Commands::new(&gpu, None);
-        losses.record(&gpu, &mut commands, (&colors, &blended), &on_device, &weights, slot).unwrap();
+        losses.record(&gpu, &mut commands, drawn, &on_device, &weights, slot).unwrap();
         commands.submit();
         assert_eq!(losses.results().read(&gpu).unwrap(), slots, "sums repeat to the bit");
         let found = ViewLoss::new([slots[2 * slot], slots[2 * slot + 1]], pixels, lambda_dssim);
@@ -142,10 +144,11 @@ fn instance_losses_on(gpu: Gpu) {
     let on_device = GpuTarget::new(&gpu, &target, Some(&labels)).unwrap();
     let colors = GpuVec::from_slice(&gpu, "colors", &[[0.1_f32; 4]; 300]).unwrap();
     let blended = GpuVec::from_slice(&gpu, "blended", &blended).unwrap();
+    let drawn = DrawnPixels { colors: &colors, blended: &blended };
     for by_coverage in [false, true] {
         let weights = LossWeights { view: 1.0, with_instances: true, by_coverage, ..LossWeights::default() };
         let mut commands = Commands::new(&gpu, None);
-        losses.record(&gpu, &mut commands, (&colors, &blended), &on_device, &weights, 1).unwrap();
+        losses.record(&gpu, &mut commands, drawn, &on_device, &weights, 1).unwrap();
         commands.submit();
         let slots = losses.results().read(&gpu).unwrap();
         let found = ViewLoss::new([slots[2], slots[3]], 300, 0.0);
@@ -179,6 +182,7 @@ fn exposed_colours_and_their_gradients_are_those_of_the_cpu() {
     let colors = GpuVec::from_slice(&gpu, "colors", &four(&rendered.pixels)).unwrap();
     let blended = GpuVec::<[f32; 4]>::zeros(&gpu, "blended", pixels).unwrap();
     let faults = GpuVec::<u32>::zeros(&gpu, "faults", fault::WORDS).unwrap();
+    let view = ExposedView { cameras: &resident, camera, colors: &colors, pixels };
     // Sums are those in double precision; another view of the camera adds to them.
     let mut expected = [0.0_f64; WIDTH];
     for lambda_dssim in [0.0, 0.2] {
@@ -197,13 +201,10 @@ fn exposed_colours_and_their_gradients_are_those_of_the_cpu() {
 
         let weights = LossWeights { lambda_dssim, view: 0.5, ..LossWeights::default() };
         let mut commands = Commands::new(&gpu, None);
-        let v_colors = &losses.v_colors;
-        exposure
-            .expose(&gpu, &mut commands, (&resident, camera), (&colors, pixels), v_colors, &faults)
-            .unwrap();
-        let images = (&exposure.recorded, &blended);
+        exposure.expose(&gpu, &mut commands, view, &losses.v_colors, &faults).unwrap();
+        let images = DrawnPixels { colors: &exposure.recorded, blended: &blended };
         losses.record(&gpu, &mut commands, images, &on_device, &weights, 2).unwrap();
-        exposure.pull_back(&gpu, &mut commands, &resident, &colors, &losses.v_colors, &faults);
+        exposure.pull_back(&gpu, &mut commands, view, &losses.v_colors, &faults);
         commands.submit();
         let found = exposure.recorded.read(&gpu).unwrap();
         compare("recorded", &flat(&found), recorded.pixels.as_flattened(), 1e-6);
@@ -222,7 +223,7 @@ fn exposed_colours_and_their_gradients_are_those_of_the_cpu() {
     assert_eq!(faults.read(&gpu).unwrap()[0], 0);
     losses.v_colors.write(&gpu, 700, &[[0.0, 1e25, 0.0, 0.0]]);
     let mut commands = Commands::new(&gpu, None);
-    exposure.pull_back(&gpu, &mut commands, &resident, &colors, &losses.v_colors, &faults);
+    exposure.pull_back(&gpu, &mut commands, view, &losses.v_colors, &faults);
     commands.submit();
     assert_eq!(faults.read(&gpu).unwrap()[..2], [fault::EXPOSURES, 0]);
 }
@@ -322,17 +323,10 @@ fn gaussians_move_as_on_the_cpu() {
             }
             groups.0.push((parameter, GroupStep { rates, steps: moments.steps }));
         }
-        let step = GaussianStep { visible_only, ..GaussianStep::default() };
+        let step = GaussianStep { groups: &groups, visible_only, renormalise: false, occupancy_limits: None };
+        let all = Optimised { parameters: &parameters, gradients: &gradients, moments: &moments };
         let mut commands = Commands::new(&gpu, None);
-        optimiser.step_gaussians(
-            &gpu,
-            &mut commands,
-            (&step, &groups),
-            (&parameters, &gradients),
-            &moments,
-            &on_device,
-            &faults,
-        );
+        optimiser.step_gaussians(&gpu, &mut commands, &step, &all, &on_device, &faults);
         commands.submit();
     }
     let all = [&parameters, &moments[0], &moments[1]].map(|rows| rows.download(&gpu).unwrap());
@@ -361,21 +355,18 @@ fn limits_and_unit_quaternions() {
     let faults = GpuVec::<u32>::zeros(&gpu, "faults", 4).unwrap();
     let optimiser = GpuOptimiser::new(&gpu).unwrap();
     let gradients = GpuGaussians::upload(&gpu, &some_gaussians(3, 0.2, 1e-3)).unwrap();
-    let step =
-        GaussianStep { renormalise: true, occupancy_limits: Some([-5.0, 5.0]), ..GaussianStep::default() };
     let sh = RowRates::Split { base: 1e-2, rest: 1e-3, split: 3, active: 48 };
     let sh = GroupStep { rates: sh, steps: 1 };
     let groups = GroupSteps(vec![(LOG_SCALES, step_of(1e-2, 1)), (SH_COEFFICIENTS, sh)]);
+    let step = GaussianStep {
+        groups: &groups,
+        visible_only: false,
+        renormalise: true,
+        occupancy_limits: Some([-5.0, 5.0]),
+    };
+    let all = Optimised { parameters: &parameters, gradients: &gradients, moments: &moments };
     let mut commands = Commands::new(&gpu, None);
-    optimiser.step_gaussians(
-        &gpu,
-        &mut commands,
-        (&step, &groups),
-        (&parameters, &gradients),
-        &moments,
-        &screen,
-        &faults,
-    );
+    optimiser.step_gaussians(&gpu, &mut commands, &step, &all, &screen, &faults);
     commands.submit();
     let found = parameters.download(&gpu).unwrap();
     assert_eq!(found.occupancy_logits, [-5.0, 0.5, 5.0]);
@@ -388,15 +379,7 @@ fn limits_and_unit_quaternions() {
     faults.write(&gpu, 1, &[1]);
     gradients.geometry.write(&gpu, 0, &[[f32::NAN; 12]; 3]);
     let mut commands = Commands::new(&gpu, None);
-    optimiser.step_gaussians(
-        &gpu,
-        &mut commands,
-        (&step, &groups),
-        (&parameters, &gradients),
-        &moments,
-        &screen,
-        &faults,
-    );
+    optimiser.step_gaussians(&gpu, &mut commands, &step, &all, &screen, &faults);
     commands.submit();
     assert_eq!(parameters.download(&gpu).unwrap(), found);
     assert_eq!(gradients.download(&gpu).unwrap().log_scales, vec![[0.0; 3]; 3]);
@@ -436,7 +419,7 @@ fn sums_that_no_optimiser_may_take_are_told_by_group() {
     let view = GpuVec::from_slice(&gpu, "view", &[0.0, f32::NAN]).unwrap();
     let total = GpuVec::from_slice(&gpu, "total", &[1.0_f32, 2.0]).unwrap();
     let mut commands = Commands::new(&gpu, None);
-    optimiser.add_calibrations(&gpu, &mut commands, (&view, &total), &faults);
+    optimiser.add_calibrations(&gpu, &mut commands, &view, &total, &faults);
     commands.submit();
     assert_eq!(faults.read(&gpu).unwrap()[0], bit(&LOG_CALIBRATIONS));
 }
@@ -468,7 +451,7 @@ fn steps_wait_after_what_counts_and_only_then() {
         let faults = GpuVec::from_slice(&gpu, "faults", &[before, 0_u32, 0, 0]).unwrap();
         let mut commands = Commands::new(&gpu, None);
         let judgement = Judgement { slot: 1, counts, known: 0, is_last };
-        judge.record(&gpu, &mut commands, judgement, (&results, &words), &faults);
+        judge.record(&gpu, &mut commands, judgement, &results, &words, &faults);
         commands.submit();
         assert_eq!(faults.read(&gpu).unwrap()[..2], [bits, waits], "case {at}");
     }
@@ -529,21 +512,14 @@ fn planes_network_and_calibrations_move_as_on_the_cpu() {
                 .step_deformation(
                     &gpu,
                     &mut commands,
-                    (step_of(1e-2, t), step_of(2e-3, t)),
+                    &GroupSteps(vec![(PLANES, step_of(1e-2, t)), (MLP, step_of(2e-3, t))]),
                     &weights,
-                    (&deformation, &gradients),
-                    &moments,
+                    &Optimised { parameters: &deformation, gradients: &gradients, moments: &moments },
                     &faults,
                 )
                 .unwrap();
-            optimiser.step_calibrations(
-                &gpu,
-                &mut commands,
-                (step_of(1e-2, t), 10.0),
-                (&calibrations, &v_mu),
-                &of_calibrations,
-                &faults,
-            );
+            let of = Optimised { parameters: &calibrations, gradients: &v_mu, moments: &of_calibrations };
+            optimiser.step_calibrations(&gpu, &mut commands, step_of(1e-2, t), 10.0, &of, &faults);
             commands.submit();
             // From equal parameters every step: where a gradient crosses zero, Adam's first steps turn the
             // rounding of a sum into a whole step.
@@ -594,12 +570,12 @@ fn statistics_and_sums_are_those_of_the_cpu() {
             }
             let of_view = GpuVec::from_slice(&gpu, "view", &rows).unwrap();
             let mut commands = Commands::new(&gpu, None);
-            optimiser.add_screen(&gpu, &mut commands, (&of_view, &total), &faults);
+            optimiser.add_screen(&gpu, &mut commands, &of_view, &total, &faults);
             commands.submit();
         }
         expected.add(&gradients);
         let mut commands = Commands::new(&gpu, None);
-        optimiser.add_statistics(&gpu, &mut commands, (&total, &statistics), &faults);
+        optimiser.add_statistics(&gpu, &mut commands, &total, &statistics, &faults);
         commands.submit();
     }
     let found = statistics.read(&gpu).unwrap();
@@ -614,7 +590,7 @@ fn statistics_and_sums_are_those_of_the_cpu() {
     optimiser.add_gaussians(&gpu, &mut commands, &view, &sum, true, &faults);
     let of_view = GpuVec::from_slice(&gpu, "view", &[1.0_f32, 2.0, 3.0]).unwrap();
     let calibrations = GpuVec::from_slice(&gpu, "total", &[10.0_f32, 20.0, 30.0]).unwrap();
-    optimiser.add_calibrations(&gpu, &mut commands, (&of_view, &calibrations), &faults);
+    optimiser.add_calibrations(&gpu, &mut commands, &of_view, &calibrations, &faults);
     commands.submit();
     let found = sum.download(&gpu).unwrap();
     assert_eq!(found.means[7], [0, 1, 2].map(|k| a.means[7][k] + b.means[7][k]));
@@ -639,7 +615,7 @@ fn identities_are_a_softmax_over_the_support() {
     let labels: Vec<[u32; 2]> = rows.labels.iter().map(|label| [u32::from(*label), 0]).collect();
     let identities = GpuVec::from_slice(&gpu, "identities", &labels).unwrap();
     let mut commands = Commands::new(&gpu, None);
-    optimiser.identities(&gpu, &mut commands, &offsets, (&estimates, &calibrations), &identities);
+    optimiser.identities(&gpu, &mut commands, &offsets, &estimates, &calibrations, &identities);
     commands.submit();
     let found = identities.read(&gpu).unwrap();
     assert!(found.iter().zip(&rows.labels).all(|(row, label)| row[0] == u32::from(*label)));
@@ -664,14 +640,14 @@ fn pulls_on(gpu: Gpu) {
         let moved = if guide_of[row] == 1 { turn * place + 0.3 } else { place };
         *mean = (moved + noise).as_vec3().to_array();
     }
-    let shifts = [0.25, -0.1, 0.4].map(glam::DVec3::splat);
-    let pulls = [Pull { weight: 10.0, reach: 0.02 }, Pull { weight: 1.0, reach: 0.002 }];
+    let shifts = [0.25, -0.1, 0.4].map(glam::DVec3::splat).to_vec();
+    let strengths = [Pull { weight: 10.0, reach: 0.02 }, Pull { weight: 1.0, reach: 0.002 }];
     let poses: Vec<Pose> = shifts
         .iter()
         .zip(rotations(&posed.means, &canonical.means, &guide_of, 3))
         .map(|(shift, rotation)| Pose { shift: *shift, rotation })
         .collect();
-    let expected = displacement_loss(&posed.means, &canonical.means, &guide_of, &poses, pulls, 2.5).1;
+    let expected = displacement_loss(&posed.means, &canonical.means, &guide_of, &poses, strengths, 2.5).1;
 
     let mut motion = GpuMotion::new(&gpu).unwrap();
     motion.send(&gpu, &guide_of).unwrap();
@@ -680,9 +656,8 @@ fn pulls_on(gpu: Gpu) {
     let (v_posed, v_canonical) =
         (GpuGaussians::zeros(&gpu, n).unwrap(), GpuGaussians::zeros(&gpu, n).unwrap());
     let mut commands = Commands::new(&gpu, None);
-    motion
-        .record(&gpu, &mut commands, (&shifts, pulls, 2.5), (&on_device, &places), (&v_posed, &v_canonical))
-        .unwrap();
+    let both = DeformedGaussians { canonical: &places, v_posed: &v_posed, v_canonical: &v_canonical };
+    motion.record(&gpu, &mut commands, &Pulls { shifts, strengths }, 2.5, &on_device, both).unwrap();
     commands.submit();
     let (found, taken) = (v_posed.download(&gpu).unwrap(), v_canonical.download(&gpu).unwrap());
     compare("pulls", found.means.as_flattened(), expected.as_flattened(), 2e-5);
@@ -700,10 +675,11 @@ fn pixels_that_are_judged_by_have_no_gradient() {
     let on_device = GpuTarget::new(&gpu, &target, None).unwrap();
     let colors = GpuVec::from_slice(&gpu, "colors", &four(&rendered.pixels)).unwrap();
     let blended = GpuVec::<[f32; 4]>::zeros(&gpu, "blended", rendered.pixels.len()).unwrap();
+    let drawn = DrawnPixels { colors: &colors, blended: &blended };
     let mut gradients = [false, true].map(|leaves_judged| {
         let weights = LossWeights { view: 1.0, leaves_judged, ..LossWeights::default() };
         let mut commands = Commands::new(&gpu, None);
-        losses.record(&gpu, &mut commands, (&colors, &blended), &on_device, &weights, 0).unwrap();
+        losses.record(&gpu, &mut commands, drawn, &on_device, &weights, 0).unwrap();
         commands.submit();
         losses.v_colors.read(&gpu).unwrap()
     });
@@ -728,9 +704,10 @@ fn labels_that_are_left_out_have_no_gradient() {
     let on_device = GpuTarget::new(&gpu, &target, Some(&labels)).unwrap();
     let colors = GpuVec::from_slice(&gpu, "colors", &four(&rendered.pixels)).unwrap();
     let blended = GpuVec::<[f32; 4]>::zeros(&gpu, "blended", rendered.pixels.len()).unwrap();
+    let drawn = DrawnPixels { colors: &colors, blended: &blended };
     let weights = LossWeights { lambda_dssim: 0.2, view: 1.0, leaves_out: true, ..LossWeights::default() };
     let mut commands = Commands::new(&gpu, None);
-    losses.record(&gpu, &mut commands, (&colors, &blended), &on_device, &weights, 0).unwrap();
+    losses.record(&gpu, &mut commands, drawn, &on_device, &weights, 0).unwrap();
     commands.submit();
     for (k, v) in losses.v_colors.read(&gpu).unwrap().iter().enumerate() {
         assert_eq!(*v == [0.0; 4], k % 3 == 2, "pixel {k}: {v:?}");

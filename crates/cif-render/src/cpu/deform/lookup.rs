@@ -215,7 +215,7 @@ impl<'a> PlanesAtTime<'a> {
                 let (values, tail) = rest.split_at(positions.len() * self.spatial_values());
                 rest = tail;
                 let values = &values[(index * SPATIAL.len() + slot) * len..][..len];
-                dispatch!(simd_level, simd => scatter_plane(simd, self, (index, slot), positions, values, v_plane));
+                dispatch!(simd_level, simd => scatter_plane(simd, self, index, slot, positions, values, v_plane));
             }
         });
     }
@@ -396,7 +396,8 @@ fn look_up_rows_backward<S: Simd>(
 fn scatter_plane<S: Simd>(
     simd: S,
     at: &PlanesAtTime<'_>,
-    (level, slot): (usize, usize),
+    level: usize,
+    slot: usize,
     positions: &[[f32; 3]],
     values: &[f32],
     v_plane: &mut [f32],

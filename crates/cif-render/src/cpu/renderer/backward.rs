@@ -14,7 +14,7 @@ use super::super::posed::PosedView;
 use super::super::project::ViewConstants;
 use super::super::project_backward::{DrawnGaussians, PosedGradient, SplatGradient, project_backward};
 use super::super::rasterize::TileImage;
-use super::super::rasterize_backward::{TileCotangents, TileInstances, rasterize_tile_backward};
+use super::super::rasterize_backward::{DrawnTile, TileCotangents, TileInstances, rasterize_tile_backward};
 use super::super::tile::{GROUPS, TilePixels, TilePlace};
 use super::super::timing::timed;
 use super::state::{CHUNK, NOT_VISIBLE, Renderer};
@@ -57,7 +57,7 @@ impl Renderer {
         v_alpha: &PixelGrid<f32>,
         gradients: &mut Gradients,
     ) {
-        self.view_backward(field, (v_color, Some(v_alpha)), 0.0, &[], gradients);
+        self.view_backward(field, v_color, Some(v_alpha), 0.0, &[], gradients);
     }
 
     /// [`Self::backward`] with gradients of its own by what the deformation adds to the centres, `[N, 3]`, or
@@ -73,13 +73,14 @@ impl Renderer {
         v_displacements: &[[f32; 3]],
         gradients: &mut Gradients,
     ) {
-        self.view_backward(field, (v_color, None), instance_weight, v_displacements, gradients);
+        self.view_backward(field, v_color, None, instance_weight, v_displacements, gradients);
     }
 
     fn view_backward(
         &mut self,
         field: &Field,
-        (v_color, v_alpha): (&PixelGrid<[f32; 3]>, Option<&PixelGrid<f32>>),
+        v_color: &PixelGrid<[f32; 3]>,
+        v_alpha: Option<&PixelGrid<f32>>,
         instance_weight: f32,
         v_displacements: &[[f32; 3]],
         gradients: &mut Gradients,
@@ -92,7 +93,7 @@ impl Renderer {
         let mut times = self.times;
         let mut pairs = std::mem::take(&mut self.pair_gradients);
         let label_mass = timed(&mut times.rasterize_backward, || {
-            self.rasterize_backward(field, (v_color, v_alpha), instance_weight, &settings, &mut pairs)
+            self.rasterize_backward(field, v_color, v_alpha, instance_weight, &settings, &mut pairs)
         });
         self.inspection.look_at_pairs(&pairs, &label_mass.values);
         timed(&mut times.project_backward, || self.calibration_backward(field, &label_mass, gradients));
@@ -176,7 +177,8 @@ impl Renderer {
     fn rasterize_backward(
         &self,
         field: &Field,
-        (v_color, v_alpha): (&PixelGrid<[f32; 3]>, Option<&PixelGrid<f32>>),
+        v_color: &PixelGrid<[f32; 3]>,
+        v_alpha: Option<&PixelGrid<f32>>,
         instance_weight: f32,
         settings: &RenderSettings,
         pairs: &mut Vec<SplatGradient>,
@@ -213,7 +215,12 @@ impl Renderer {
                 return;
             }
             let place = self.place(tile);
-            let entries = (lists.tile(tile), &tape.tiles[tile].met[..]);
+            let drawn = DrawnTile {
+                splats: &tape.splats,
+                entries: lists.tile(tile),
+                met: &tape.tiles[tile].met,
+                place: &place,
+            };
             let mut cotangents = tile_cotangents(&place, &v_color.pixels, &tape.color);
             if let Some(v_alpha) = v_alpha {
                 add_alpha(&mut cotangents, &place, &v_alpha.pixels, &tape.tiles[tile].transmittance);
@@ -233,13 +240,30 @@ impl Renderer {
             });
             dispatch!(level, simd => if instances.is_some() {
                 rasterize_tile_backward::<_, true>(
-                    simd, &tape.splats, entries, &place, &mut cotangents, instances.as_ref(), pairs, mass);
+                    simd, drawn, &mut cotangents, instances.as_ref(), pairs, mass);
             } else {
                 rasterize_tile_backward::<_, false>(
-                    simd, &tape.splats, entries, &place, &mut cotangents, None, pairs, mass);
+                    simd, drawn, &mut cotangents, None, pairs, mass);
             });
         });
         LabelMass { offsets, values }
+    }
+
+    /// Sums of the pairs of each splat, in depth order, as pairs lie in the lists of tiles: by rows, each would be fetched
+    /// from memory on its own.
+    fn splat_sums(&self, pairs: &[SplatGradient]) -> Vec<SplatGradient> {
+        let tape = &self.tape;
+        (0..tape.splats.len())
+            .into_par_iter()
+            .with_min_len(CHUNK)
+            .map(|rank| {
+                let mut sum = SplatGradient::default();
+                for &pair in tape.lists.pairs_of(rank) {
+                    sum.add(&pairs[pair as usize]);
+                }
+                sum
+            })
+            .collect()
     }
 
     /// Sums each splat's pairs and carries them to the raw parameters. Returns the rows with a gradient by what a
@@ -255,18 +279,7 @@ impl Renderer {
         let tape = &self.tape;
         let n = field.gaussians.len();
         let rank_of = self.ranks(n);
-        // In depth order, as pairs lie in the lists of tiles: by rows, each would be fetched from memory on its own.
-        let sums: Vec<SplatGradient> = (0..tape.splats.len())
-            .into_par_iter()
-            .with_min_len(CHUNK)
-            .map(|rank| {
-                let mut sum = SplatGradient::default();
-                for &pair in tape.lists.pairs_of(rank) {
-                    sum.add(&pairs[pair as usize]);
-                }
-                sum
-            })
-            .collect();
+        let sums = self.splat_sums(pairs);
         let posed = PosedView::new(&field.gaussians, &tape.posed);
         let moves_sh = !tape.posed.sh_coefficients.is_empty();
         let is_moved = |parameter: &Parameter| match *parameter {
@@ -301,8 +314,7 @@ impl Renderer {
                 for found in found.chunks(LANES) {
                     let mut drawn = DrawnGaussians::new(posed.sh(found[0].1.gaussian as usize));
                     for (lane, (_, splat, v)) in found.iter().enumerate() {
-                        let gaussian = splat.gaussian as usize;
-                        drawn.set(lane, (posed.row(gaussian), posed.sh(gaussian)), splat, v);
+                        drawn.set(lane, &posed, splat, v);
                     }
                     let posed_gradients = dispatch!(level, simd => project_backward(simd, view, &drawn));
                     for (lane, (row, splat, v)) in found.iter().enumerate() {

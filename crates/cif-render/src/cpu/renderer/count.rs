@@ -51,23 +51,19 @@ impl Renderer {
         self.add_tiles(&tiles, counts);
     }
 
-    /// Adds the mass that contributors of the labelled pixels of a view have by a rule to `counts`; of unlabelled
-    /// pixels nothing counts. Source: methods reference 8.4 and 8.5.
+    /// Adds the mass that contributors of the labelled pixels of the view that was prepared last ([`Self::prepare`]) have
+    /// by a rule to `counts`; of unlabelled pixels nothing counts. Source: methods reference 8.4 and 8.5.
     ///
     /// # Panics
-    /// As [`Self::count_identities`].
+    /// Without such a view, when `labels` and it differ in size, or the counts are of fewer Gaussians.
     pub fn count_contributors(
-        &mut self,
-        field: &Field,
-        camera: &PinholeCamera,
-        time: f64,
-        settings: &RenderSettings,
-        (labels, rule): (&PixelGrid<u16>, &ContributorRule),
+        &self,
+        labels: &PixelGrid<u16>,
+        rule: &ContributorRule,
         counts: &mut IdentityCounts,
     ) {
-        assert_eq!((labels.width, labels.height), (camera.width, camera.height), "label map size");
-        assert_eq!(counts.gaussians(), field.gaussians.len(), "counts of other Gaussians");
-        self.prepare(field, camera, time, &RenderSettings { instances: None, ..*settings });
+        let (view, ..) = self.tape.view.expect("a view was prepared");
+        assert_eq!((labels.width, labels.height), (view.width, view.height), "label map size");
         let (tape, level) = (&self.tape, self.level);
         let lists = &tape.lists;
         let tiles: Vec<(Vec<u16>, Vec<f32>)> = (0..lists.tiles())

@@ -296,6 +296,17 @@ pub struct DeformationGradients {
     lines_backward: Kernel,
 }
 
+/// Gaussians on both sides of a deformation, with their gradients.
+#[derive(Clone, Copy, Debug)]
+pub struct DeformedGaussians<'a> {
+    /// The canonical ones.
+    pub canonical: &'a GpuGaussians,
+    /// Gradients by the Gaussians at the time of the view.
+    pub v_posed: &'a GpuGaussians,
+    /// Gradients by the canonical ones.
+    pub v_canonical: &'a GpuGaussians,
+}
+
 impl DeformationGradients {
     /// Zeros in the shape of a deformation.
     ///
@@ -327,27 +338,31 @@ impl DeformationGradients {
         })
     }
 
-    /// Records the gradients that follow from `v_posed`, those by the Gaussians at the time of the forward pass
-    /// recorded before: adds those of planes and network to `self`, and those of the canonical geometry, the direct
-    /// path included, to `v_canonical`. Spherical harmonics are left to the caller: their gradient is that of the
+    /// Records the gradients that follow from those by the Gaussians at the time of the forward pass recorded before:
+    /// adds those of planes and network to `self`, and those of the canonical geometry, the direct path included, to
+    /// `v_canonical`. Spherical harmonics are left to the caller: their gradient is that of the
     /// posed ones. Faults are bits of the first word of `faults`.
     pub fn backward(
         &mut self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        (deformation, time): (&GpuDeformation, f64),
-        canonical: &GpuGaussians,
-        v_posed: &GpuGaussians,
-        v_canonical: &GpuGaussians,
+        deformation: &GpuDeformation,
+        time: f64,
+        gaussians: DeformedGaussians<'_>,
         faults: &GpuVec<u32>,
     ) {
         let Some(moving) = &deformation.moving else {
-            self.backward_all(gpu, commands, (deformation, time), canonical, v_posed, v_canonical, faults);
+            self.backward_all(gpu, commands, deformation, time, gaussians, faults);
             return;
         };
+        let DeformedGaussians { v_posed, v_canonical, .. } = gaussians;
         moving.take_gradients(gpu, commands, v_posed, v_canonical);
-        let (v_moving, v_places) = (&moving.v_posed, &moving.v_canonical);
-        self.backward_all(gpu, commands, (deformation, time), &moving.canonical, v_moving, v_places, faults);
+        let of_moving = DeformedGaussians {
+            canonical: &moving.canonical,
+            v_posed: &moving.v_posed,
+            v_canonical: &moving.v_canonical,
+        };
+        self.backward_all(gpu, commands, deformation, time, of_moving, faults);
         moving.put_gradients(gpu, commands, v_posed, v_canonical, faults);
     }
 
@@ -355,12 +370,12 @@ impl DeformationGradients {
         &mut self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        (deformation, time): (&GpuDeformation, f64),
-        canonical: &GpuGaussians,
-        v_posed: &GpuGaussians,
-        v_canonical: &GpuGaussians,
+        deformation: &GpuDeformation,
+        time: f64,
+        gaussians: DeformedGaussians<'_>,
         faults: &GpuVec<u32>,
     ) {
+        let DeformedGaussians { canonical, v_posed, v_canonical } = gaussians;
         let shape = &deformation.shape;
         let n = canonical.len();
         let chunks = n.div_ceil(shape.chunk_rows as usize);

@@ -40,6 +40,16 @@ pub(super) struct MovingRows {
     moves_sh: bool,
 }
 
+/// Buffers between which rows are copied.
+struct CopiedRows<'a> {
+    source: &'a wgpu::Buffer,
+    target: &'a wgpu::Buffer,
+    /// Gradients that `put_gradients` reads; any buffer for the others.
+    v_posed: &'a wgpu::Buffer,
+    /// Fault words; see [`crate::wgpu::faults`].
+    faults: &'a wgpu::Buffer,
+}
+
 impl MovingRows {
     /// `kernels` are those of the file.
     pub(super) fn new(
@@ -96,9 +106,7 @@ impl MovingRows {
         gpu: &Gpu,
         kernel: &Kernel,
         uniform: &Uniform<Moving>,
-        (source, target): (&wgpu::Buffer, &wgpu::Buffer),
-        v_posed: &wgpu::Buffer,
-        faults: &wgpu::Buffer,
+        copied: &CopiedRows<'_>,
     ) -> wgpu::BindGroup {
         kernel.bind(
             gpu,
@@ -106,10 +114,10 @@ impl MovingRows {
                 uniform.binding(),
                 self.rows.binding(),
                 self.places.binding(),
-                source.as_entire_binding(),
-                target.as_entire_binding(),
-                v_posed.as_entire_binding(),
-                faults.as_entire_binding(),
+                copied.source.as_entire_binding(),
+                copied.target.as_entire_binding(),
+                copied.v_posed.as_entire_binding(),
+                copied.faults.as_entire_binding(),
             ],
         )
     }
@@ -120,7 +128,8 @@ impl MovingRows {
         gpu: &Gpu,
         commands: &mut Commands<'_>,
         kernel: &Kernel,
-        (source, target): (&GpuGaussians, &GpuGaussians),
+        source: &GpuGaussians,
+        target: &GpuGaussians,
     ) {
         let nothing = self.places.buffer();
         let pairs = [
@@ -129,8 +138,9 @@ impl MovingRows {
         ];
         for (uniform, source, target, width, wanted) in pairs {
             if wanted {
-                let group =
-                    self.bind(gpu, kernel, uniform, (source, target), nothing, self.no_faults.buffer());
+                let faults = self.no_faults.buffer();
+                let copied = CopiedRows { source, target, v_posed: nothing, faults };
+                let group = self.bind(gpu, kernel, uniform, &copied);
                 commands.stage("deform", |stage| {
                     stage.dispatch(kernel, &group, workgroups(self.len() * width, THREADS));
                 });
@@ -140,7 +150,7 @@ impl MovingRows {
 
     /// Canonical rows, before the forward pass.
     pub(super) fn take_canonical(&self, gpu: &Gpu, commands: &mut Commands<'_>, all: &GpuGaussians) {
-        self.copy(gpu, commands, &self.take, (all, &self.canonical));
+        self.copy(gpu, commands, &self.take, all, &self.canonical);
     }
 
     /// Posed Gaussians after it: what stands still is posed as it is.
@@ -155,7 +165,7 @@ impl MovingRows {
         if self.moves_sh {
             commands.copy(&canonical.sh, &posed.sh);
         }
-        self.copy(gpu, commands, &self.put, (&self.posed, posed));
+        self.copy(gpu, commands, &self.put, &self.posed, posed);
     }
 
     /// Gradients before the backward pass.
@@ -166,15 +176,14 @@ impl MovingRows {
         v_posed: &GpuGaussians,
         v_canonical: &GpuGaussians,
     ) {
-        self.copy(gpu, commands, &self.take, (v_posed, &self.v_posed));
-        let group = self.bind(
-            gpu,
-            &self.take,
-            &self.geometry,
-            (v_canonical.geometry.buffer(), self.v_canonical.geometry.buffer()),
-            self.places.buffer(),
-            self.no_faults.buffer(),
-        );
+        self.copy(gpu, commands, &self.take, v_posed, &self.v_posed);
+        let copied = CopiedRows {
+            source: v_canonical.geometry.buffer(),
+            target: self.v_canonical.geometry.buffer(),
+            v_posed: self.places.buffer(),
+            faults: self.no_faults.buffer(),
+        };
+        let group = self.bind(gpu, &self.take, &self.geometry, &copied);
         commands.stage("deform", |stage| {
             stage.dispatch(&self.take, &group, workgroups(self.len() * GEOMETRY_FLOATS, THREADS));
         });
@@ -189,14 +198,13 @@ impl MovingRows {
         v_canonical: &GpuGaussians,
         faults: &GpuVec<u32>,
     ) {
-        let group = self.bind(
-            gpu,
-            &self.put_gradients,
-            &self.geometry,
-            (self.v_canonical.geometry.buffer(), v_canonical.geometry.buffer()),
-            v_posed.geometry.buffer(),
-            faults.buffer(),
-        );
+        let copied = CopiedRows {
+            source: self.v_canonical.geometry.buffer(),
+            target: v_canonical.geometry.buffer(),
+            v_posed: v_posed.geometry.buffer(),
+            faults: faults.buffer(),
+        };
+        let group = self.bind(gpu, &self.put_gradients, &self.geometry, &copied);
         let floats = v_canonical.len() * GEOMETRY_FLOATS;
         commands.stage("deform backward: planes", |stage| {
             stage.dispatch(&self.put_gradients, &group, workgroups(floats, THREADS));

@@ -209,10 +209,9 @@ fn gradients_agree_with_the_reference_and_repeat_to_the_bit() {
                 gradients.backward(
                     &gpu,
                     &mut commands,
-                    (&deformation, time),
-                    &canonical,
-                    &v_posed,
-                    &v_canonical,
+                    &deformation,
+                    time,
+                    DeformedGaussians { canonical: &canonical, v_posed: &v_posed, v_canonical: &v_canonical },
                     &faults,
                 );
                 commands.submit();
@@ -289,10 +288,9 @@ fn several_chunks_are_as_one() {
     gradients.backward(
         &gpu,
         &mut commands,
-        (&deformation, 0.37),
-        &canonical,
-        &v_posed,
-        &v_canonical,
+        &deformation,
+        0.37,
+        DeformedGaussians { canonical: &canonical, v_posed: &v_posed, v_canonical: &v_canonical },
         &faults,
     );
     commands.submit();
@@ -330,10 +328,9 @@ fn gradients_that_are_not_finite_are_reported() {
         gradients.backward(
             &gpu,
             &mut commands,
-            (&deformation, 0.5),
-            &canonical,
-            &v_posed,
-            &v_canonical,
+            &deformation,
+            0.5,
+            DeformedGaussians { canonical: &canonical, v_posed: &v_posed, v_canonical: &v_canonical },
             &faults,
         );
         commands.submit();

@@ -378,7 +378,8 @@ pub fn pose<'a>(
     gpu: &Gpu,
     commands: &mut Commands<'_>,
     time: f64,
-    (deformation, groups): (Option<&GpuDeformation>, Option<&'a GpuPoses>),
+    deformation: Option<&GpuDeformation>,
+    groups: Option<&'a GpuPoses>,
     canonical: &'a GpuGaussians,
     posed: &'a GpuGaussians,
 ) -> PosedInput<'a> {

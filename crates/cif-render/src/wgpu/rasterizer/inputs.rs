@@ -54,6 +54,15 @@ pub(crate) enum Coefficients<'a> {
     Turned(&'a GpuVec<[f32; SH_FLOATS]>, &'a GpuVec<[f32; 4]>),
 }
 
+/// Gaussians at the time of a view, their spherical harmonics in any form.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct PosedGaussians<'a> {
+    /// As in [`GpuGaussians::geometry`].
+    pub(crate) geometry: &'a GpuVec<[f32; GEOMETRY_FLOATS]>,
+    /// Spherical harmonics.
+    pub(crate) sh: Coefficients<'a>,
+}
+
 /// A view to be drawn.
 #[derive(Clone, Copy, Debug)]
 pub struct ViewInput<'a> {

@@ -29,7 +29,7 @@ mod tiles;
 
 use self::arrays::{Arrays, CountingArrays};
 pub use self::blend::BlendWeightGradients;
-pub(super) use self::inputs::Coefficients;
+pub(super) use self::inputs::{Coefficients, PosedGaussians};
 pub use self::inputs::{GpuStatistics, LabelInput, PosedGradients, PosedInput, ViewInput};
 use super::blend::BlendKernels;
 use super::buffers::{GpuVec, Recorded, Uniform};

@@ -1,11 +1,10 @@
 //! Projection, depth order and tile counts, and the gradients of the posed Gaussians.
 
 use super::Rasterizer;
-use super::inputs::{Coefficients, PosedInput, ViewInput};
+use super::inputs::{Coefficients, PosedGaussians, PosedInput, ViewInput};
 use crate::wgpu::buffers::GpuVec;
 use crate::wgpu::device::Gpu;
 use crate::wgpu::error::GpuError;
-use crate::wgpu::gaussians::GEOMETRY_FLOATS;
 use crate::wgpu::identities::DeviceIdentities;
 use crate::wgpu::kernel::{Commands, workgroups};
 use crate::wgpu::sort::Count;
@@ -29,7 +28,7 @@ impl Rasterizer {
         identities: Option<&DeviceIdentities>,
         input: &ViewInput<'_>,
     ) -> Result<(), GpuError> {
-        let posed = (gaussians.geometry, gaussians.coefficients());
+        let posed = PosedGaussians { geometry: gaussians.geometry, sh: gaussians.coefficients() };
         self.project_rows(gpu, commands, posed, identities, input, None)
     }
 
@@ -45,18 +44,27 @@ impl Rasterizer {
         &mut self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        gaussians: (&GpuVec<[f32; GEOMETRY_FLOATS]>, Coefficients<'_>),
+        gaussians: PosedGaussians<'_>,
         identities: Option<&DeviceIdentities>,
         input: &ViewInput<'_>,
         rows: Option<[u32; 2]>,
     ) -> Result<(), GpuError> {
-        let (geometry, sh) = gaussians;
-        let (sh, turns, variant) = match sh {
-            Coefficients::Full(sh) => (sh.buffer(), None, 0),
-            Coefficients::Packed(sh) => (sh.buffer(), None, 1),
-            Coefficients::Turned(sh, turns) => (sh.buffer(), Some(turns.buffer()), 2),
-        };
-        let n = geometry.len();
+        self.begin_view(gpu, gaussians.geometry.len(), identities, input, rows)?;
+        commands.clear(&self.arrays.work);
+        self.project_splats(gpu, commands, gaussians)?;
+        self.sort_by_depth(gpu, commands)?;
+        self.count_tiles(gpu, commands, identities)
+    }
+
+    /// Sets the constants of a view, and makes room for what it gets per Gaussian, tile and pixel.
+    fn begin_view(
+        &mut self,
+        gpu: &Gpu,
+        n: usize,
+        identities: Option<&DeviceIdentities>,
+        input: &ViewInput<'_>,
+        rows: Option<[u32; 2]>,
+    ) -> Result<(), GpuError> {
         let mut view = View::new(input.camera, input.settings, n);
         if let Some([first, count]) = rows {
             (view.first_row, view.tiles[1]) = (first, count);
@@ -86,10 +94,22 @@ impl Rasterizer {
         view.slot_capacity = arrays.label_mass.len() as u32;
         self.view = view;
         self.uniform.write(gpu, &view);
+        Ok(())
+    }
 
-        let rows = identities.map_or(&arrays.no_labels, |identities| &identities.row_offsets);
-        commands.clear(&arrays.work);
-        let uniform = self.uniform.buffer();
+    /// Records the splats of the Gaussians, with the kernel for the form that their spherical harmonics have.
+    fn project_splats(
+        &mut self,
+        gpu: &Gpu,
+        commands: &mut Commands<'_>,
+        gaussians: PosedGaussians<'_>,
+    ) -> Result<(), GpuError> {
+        let PosedGaussians { geometry, sh } = gaussians;
+        let (sh, turns, variant) = match sh {
+            Coefficients::Full(sh) => (sh.buffer(), None, 0),
+            Coefficients::Packed(sh) => (sh.buffer(), None, 1),
+            Coefficients::Turned(sh, turns) => (sh.buffer(), Some(turns.buffer()), 2),
+        };
         if variant == 1 && self.kernels.project_packed.is_none() {
             let [kernel] = entries(gpu, &PROJECT_PACKED)?;
             self.kernels.project_packed = Some(kernel);
@@ -104,8 +124,9 @@ impl Rasterizer {
             (2, _, Some([turned, _])) => turned,
             _ => &self.kernels.project,
         };
+        let arrays = &self.arrays;
         let mut buffers = vec![
-            uniform,
+            self.uniform.buffer(),
             geometry.buffer(),
             sh,
             arrays.splats.buffer(),
@@ -114,8 +135,12 @@ impl Rasterizer {
         ];
         buffers.extend(turns);
         let project = self.cache.get(gpu, ("project", variant), kernel, &buffers);
-        commands.stage("project", |stage| stage.dispatch(kernel, &project, workgroups(n, 64)));
+        commands.stage("project", |stage| stage.dispatch(kernel, &project, workgroups(geometry.len(), 64)));
+        Ok(())
+    }
 
+    fn sort_by_depth(&mut self, gpu: &Gpu, commands: &mut Commands<'_>) -> Result<(), GpuError> {
+        let n = self.view.gaussians as usize;
         let mut sorted = Ok(0);
         commands.stage("sort by depth", |stage| {
             sorted = self.sort.record(
@@ -124,19 +149,27 @@ impl Rasterizer {
                 stage,
                 &mut self.scan,
                 "depth",
-                &arrays.depth,
+                &self.arrays.depth,
                 Count::Host(n),
                 32,
-                &arrays.work,
+                &self.arrays.work,
             );
         });
         self.depth_result = sorted?;
-        let bin = self.cache.get(
-            gpu,
-            ("bin", 0),
-            &self.kernels.count,
-            &arrays.bin_bindings(uniform, self.depth_result, rows),
-        );
+        Ok(())
+    }
+
+    /// Records how many tiles and label slots each splat has, and where in their lists it begins.
+    fn count_tiles(
+        &mut self,
+        gpu: &Gpu,
+        commands: &mut Commands<'_>,
+        identities: Option<&DeviceIdentities>,
+    ) -> Result<(), GpuError> {
+        let (arrays, n) = (&self.arrays, self.view.gaussians as usize);
+        let rows = identities.map_or(&arrays.no_labels, |identities| &identities.row_offsets);
+        let bindings = arrays.bin_bindings(self.uniform.buffer(), self.depth_result, rows);
+        let bin = self.cache.get(gpu, ("bin", 0), &self.kernels.count, &bindings);
         let mut scanned = Ok(());
         commands.stage("bin", |stage| {
             stage.dispatch(&self.kernels.count, &bin, workgroups(n, 64));

@@ -107,7 +107,6 @@ impl StandIn {
         of_field: Option<&GpuDeformation>,
     ) -> PosedInput<'a> {
         let deformation = self.deformation.as_ref().or(of_field).filter(|_| self.moves);
-        let motion = (deformation, self.groups.as_ref());
-        poses::pose(gpu, commands, time, motion, &self.canonical, &self.posed)
+        poses::pose(gpu, commands, time, deformation, self.groups.as_ref(), &self.canonical, &self.posed)
     }
 }

@@ -1,6 +1,7 @@
 //! A GPU with everything of a run that lies on it, and what the host remembers of the device.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 use cif_dataset::Dataset;
@@ -43,7 +44,7 @@ pub(crate) struct GpuEngine {
     /// Where the rows of a set that is changing come from.
     pub(super) origins: Option<Vec<u32>>,
     /// Training images on the device, by index in the capture and width, and their bytes.
-    pub(super) targets: BTreeMap<(usize, u32), GpuTarget>,
+    pub(super) targets: BTreeMap<(usize, u32), Arc<GpuTarget>>,
     pub(super) target_bytes: u64,
     /// `None` until the first step.
     pub(super) resident: Option<Resident>,
@@ -102,7 +103,8 @@ impl Fetched {
 /// will have.
 fn refuse_too_large(
     gpu: &Gpu,
-    (dataset, config): (&Dataset, &TrainConfig),
+    dataset: &Dataset,
+    config: &TrainConfig,
     gaussians: usize,
     deformation: Option<&cif_field::Deformation>,
 ) -> Result<(), TrainError> {
@@ -144,11 +146,12 @@ impl GpuEngine {
     /// When the scene may grow beyond what the device holds, with the arithmetic; when the driver rejects a kernel.
     pub(crate) fn new(
         gpu: &Gpu,
-        capture: (&Dataset, &TrainConfig),
+        dataset: &Dataset,
+        config: &TrainConfig,
         gaussians: usize,
         deformation: Option<&cif_field::Deformation>,
     ) -> Result<Self, TrainError> {
-        refuse_too_large(gpu, capture, gaussians, deformation)?;
+        refuse_too_large(gpu, dataset, config, gaussians, deformation)?;
         Ok(Self {
             rasterizer: Rasterizer::new(gpu)?,
             losses: GpuLosses::new(gpu)?,

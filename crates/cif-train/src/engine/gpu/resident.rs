@@ -149,7 +149,7 @@ impl Resident {
     pub(super) fn pose(&self, gpu: &Gpu, commands: &mut Commands<'_>, time: f64) -> PosedInput<'_> {
         let deformation = self.deformation.as_ref().map(|resident| &resident.parameters);
         let groups = self.poses.as_ref().map(|resident| &resident.groups);
-        poses::pose(gpu, commands, time, (deformation, groups), &self.canonical, &self.posed)
+        poses::pose(gpu, commands, time, deformation, groups, &self.canonical, &self.posed)
     }
 
     /// Nothing yet.

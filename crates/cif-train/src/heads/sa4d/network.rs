@@ -94,7 +94,7 @@ impl Network {
             let (weights, biases) = layer(network, k);
             let mut out = vec![0.0; rows * WIDTHS[k + 1]];
             let shape = [rows, WIDTHS[k], WIDTHS[k + 1]];
-            self.products.layer(shape, (&values[k], weights, biases), k + 1 < LAYERS, &mut out);
+            self.products.layer(shape, &values[k], weights, biases, k + 1 < LAYERS, &mut out);
             values.push(out);
         }
         values
