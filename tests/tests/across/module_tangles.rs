@@ -23,7 +23,7 @@ const MOST: [(&str, usize); 21] = [
     ("cif-masks", 0),
     ("cif-batch", 0),
     ("cif-capture", 0),
-    ("cif-train", 5),
+    ("cif-train", 0),
     ("cif-scene", 0),
     ("cif-usd", 0),
     ("cif-gltf", 0),
