@@ -199,7 +199,7 @@ fn agreeing(side: &Side, texture: &Texture, all: &[DVec3]) -> Vec<Agreeing> {
     let best = |middle: DQuat| {
         let rotation = |turn: DVec3| (DQuat::from_scaled_axis(turn) * middle).normalize();
         let score = |turn: DVec3| texture.agreement(side, rotation(turn)).share();
-        let coarse = best_around((score(DVec3::ZERO), DVec3::ZERO), (DVec3::ZERO, &changes), score);
+        let coarse = best_around((score(DVec3::ZERO), DVec3::ZERO), DVec3::ZERO, &changes, score);
         let (agreement, turn) = refined(coarse, score);
         Agreeing { rotation: rotation(turn), agreement }
     };
@@ -293,7 +293,8 @@ fn grid(reach: f64, spacing: f64) -> Vec<DVec3> {
 /// The best of some turn and its score, and of those a grid away from a middle.
 fn best_around(
     mut best: (f64, DVec3),
-    (middle, changes): (DVec3, &[DVec3]),
+    middle: DVec3,
+    changes: &[DVec3],
     score: impl Fn(DVec3) -> f64,
 ) -> (f64, DVec3) {
     for change in changes {
@@ -308,7 +309,7 @@ fn best_around(
 /// The same on ever finer grids around the best.
 fn refined(mut best: (f64, DVec3), score: impl Fn(DVec3) -> f64) -> (f64, DVec3) {
     for spacing in FINER {
-        best = best_around(best, (best.1, &grid(1.8 * spacing, spacing)), &score);
+        best = best_around(best, best.1, &grid(1.8 * spacing, spacing), &score);
     }
     best
 }
@@ -334,7 +335,7 @@ fn even_turns(sides: &[Side]) -> Vec<Even> {
     let best = |first: usize| {
         let few = &sides[first..(first + WINDOW).min(sides.len())];
         let score = |turn: DVec3| agreement(few, &evenly(few, turn));
-        let coarse = best_around((f64::NEG_INFINITY, DVec3::ZERO), (DVec3::ZERO, &turns), score);
+        let coarse = best_around((f64::NEG_INFINITY, DVec3::ZERO), DVec3::ZERO, &turns, score);
         let (agreement, turn) = refined(coarse, score);
         Even { first, turn, agreement }
     };
@@ -356,48 +357,50 @@ fn grown(sides: &[Side], evens: &[Even], start: &Even, mut texture: Texture) -> 
         let around = evens.iter().filter(|even| (even.first..even.first + WINDOW).contains(&k));
         around.max_by(|a, b| a.agreement.total_cmp(&b.agreement)).map_or(turn, |even| even.turn)
     };
-    let mut rate = turn;
-    for k in last + 1..sides.len() {
-        let ahead = (k..sides.len()).take(AHEAD);
-        turns[k] = followed(sides, (k - 1, turns[k - 1]), ahead, &texture, (&mut rate, even(k)));
-        texture.add(&Texture::of(&sides[k], turns[k]));
-    }
-    rate = turn;
-    for k in (0..first).rev() {
-        let ahead = (0..=k).rev().take(AHEAD);
-        turns[k] = followed(sides, (k + 1, turns[k + 1]), ahead, &texture, (&mut rate, even(k)));
-        texture.add(&Texture::of(&sides[k], turns[k]));
+    let onwards: [Vec<usize>; 2] = [(last..sides.len()).collect(), (0..=first).rev().collect()];
+    for places in onwards {
+        let mut rate = turn;
+        for at in 1..places.len() {
+            let (known, k) = (places[at - 1], places[at]);
+            let known = Turned { side: &sides[known], rotation: turns[known] };
+            let ahead: Vec<&Side> = places[at..].iter().take(AHEAD).map(|place| &sides[*place]).collect();
+            rate = rate_ahead(&known, &ahead, &texture, rate, even(k));
+            turns[k] = known.onward(&sides[k], rate);
+            texture.add(&Texture::of(&sides[k], turns[k]));
+        }
     }
     turns
 }
 
-/// Rotation of the first of some sides, all of which turn on evenly from a known one, near the rate of before.
-fn followed(
-    sides: &[Side],
-    (known, from): (usize, DQuat),
-    ahead: impl Iterator<Item = usize> + Clone,
-    texture: &Texture,
-    (rate, even): (&mut DVec3, DVec3),
-) -> DQuat {
-    let rotation = |turn: DVec3, k: usize| {
-        let steps = sides[k].time as f64 - sides[known].time as f64;
-        DQuat::from_scaled_axis(steps * turn) * from
-    };
+/// A side whose rotation is known.
+struct Turned<'a> {
+    side: &'a Side,
+    rotation: DQuat,
+}
+
+impl Turned<'_> {
+    /// Rotation of another side, after so much of a turn from each time of the sequence to the next.
+    fn onward(&self, other: &Side, turn: DVec3) -> DQuat {
+        let steps = other.time as f64 - self.side.time as f64;
+        DQuat::from_scaled_axis(steps * turn) * self.rotation
+    }
+}
+
+/// Turn from one time of the sequence to the next with which the texture of the sides ahead of a known one agrees best,
+/// near the `rate` of before it or that of an even turn of the sides around.
+fn rate_ahead(known: &Turned<'_>, ahead: &[&Side], texture: &Texture, rate: DVec3, even: DVec3) -> DVec3 {
     let score = |turn: DVec3| {
         let mut sum = Agreement::default();
-        ahead.clone().for_each(|k| sum += texture.agreement(&sides[k], rotation(turn, k)));
-        let change = (turn - *rate).length().min(2.0 * (turn - even).length() + 0.1);
+        ahead.iter().for_each(|side| sum += texture.agreement(side, known.onward(side, turn)));
+        let change = (turn - rate).length().min(2.0 * (turn - even).length() + 0.1);
         sum.share() - CHANGE_COST * change * change / (CHANGE * CHANGE)
     };
     let changes = grid(CHANGE, APART);
-    let mut best = (score(*rate), *rate);
-    for around in [*rate, even] {
-        best = best_around(best, (around, &changes), score);
+    let mut best = (score(rate), rate);
+    for around in [rate, even] {
+        best = best_around(best, around, &changes, score);
     }
-    let (_, turn) = refined(best, score);
-    *rate = turn;
-    let next = ahead.clone().next().unwrap_or(known);
-    rotation(*rate, next)
+    refined(best, score).1
 }
 
 /// Turns every side to agree with all others.

@@ -6,6 +6,7 @@ use rand::seq::SliceRandom;
 
 use super::fit::{Fit, GREY};
 use super::shape::{Adam, Shape};
+use super::split::SplitViews;
 
 /// Captured times from one knot of the field to the next.
 const KNOT: usize = 3;
@@ -87,7 +88,8 @@ fn loss(
     fit: &Fit<'_>,
     shape: &mut Shape,
     bend: Option<&Bend>,
-    (view, level): (usize, usize),
+    view: usize,
+    level: usize,
     differentiates: bool,
 ) -> f64 {
     let view = &fit.views[view];
@@ -101,40 +103,36 @@ fn loss(
     value
 }
 
-/// Mean loss over views that were left out, after a fit to others in the poses that there are.
-fn refitted(
-    fit: &Fit<'_>,
-    mut bend: Option<Bend>,
-    (train, judged): (&[usize], &[usize]),
-    level: usize,
-) -> f64 {
-    let (mut shape, mut rng, mut order) = (fit.shape.copied(), fit.rng.clone(), train.to_vec());
-    for step in 0..if train.is_empty() { 0 } else { STEPS } {
+/// Mean loss over the views that judge, after a fit to others in the poses that there are.
+fn refitted(fit: &Fit<'_>, mut bend: Option<Bend>, views: &SplitViews, level: usize) -> f64 {
+    let (mut shape, mut rng, mut order) = (fit.shape.copied(), fit.rng.clone(), views.train.clone());
+    for step in 0..if order.is_empty() { 0 } else { STEPS } {
         let place = step % order.len();
         if place == 0 {
             order.shuffle(&mut rng);
         }
         let (view, rate) = (order[place], LAST.powf(step as f64 / STEPS as f64));
         let places = shape.centres();
-        loss(fit, &mut shape, bend.as_ref(), (view, level), true);
+        loss(fit, &mut shape, bend.as_ref(), view, level, true);
         if let Some(bend) = &mut bend {
             bend.step(fit.views[view].time_index, &places, &shape.centre_gradients(), RATE * rate);
         }
         shape.step(SHAPE_RATE * rate);
     }
     let weight = |view: &usize| fit.views[*view].visible;
-    let mut judge = |view: &usize| weight(view) * loss(fit, &mut shape, bend.as_ref(), (*view, level), false);
+    let mut judge = |view: &usize| weight(view) * loss(fit, &mut shape, bend.as_ref(), *view, level, false);
+    let judged = views.judged();
     let sum: f64 = judged.iter().map(&mut judge).sum();
     sum / judged.iter().map(weight).sum::<f64>().max(1e-12)
 }
 
 /// Error of an object that may bend, on views that were left out.
-pub(super) fn bent(fit: &Fit<'_>, views: (&[usize], &[usize]), level: usize) -> f64 {
+pub(super) fn bent(fit: &Fit<'_>, views: &SplitViews, level: usize) -> f64 {
     refitted(fit, Some(Bend::none(fit)), views, level)
 }
 
 /// The same, of that of one that may not.
-pub(super) fn gain(fit: &Fit<'_>, views: (&[usize], &[usize]), level: usize) -> f64 {
+pub(super) fn gain(fit: &Fit<'_>, views: &SplitViews, level: usize) -> f64 {
     let (rigid, bent) = rayon::join(|| refitted(fit, None, views, level), || bent(fit, views, level));
     bent / rigid.max(1e-12)
 }

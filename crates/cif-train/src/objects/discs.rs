@@ -4,7 +4,7 @@
 use std::f64::consts::TAU;
 
 use cif_geometry::PinholeCamera;
-use glam::{DVec2, DVec3};
+use glam::DVec2;
 use rand::RngExt;
 use rand_pcg::Pcg64;
 
@@ -79,14 +79,15 @@ pub(super) fn ball<'a>(views: impl Iterator<Item = &'a ObjectView>) -> Option<Ba
     };
     let there: Vec<&(&ObjectView, Disc)> = discs.iter().filter(is_there).collect();
     let radius = median(&mut there.iter().map(|seen| size(seen)).collect::<Vec<_>>());
+    let ball = Ball { centre, radius };
     let is_as_large =
         |seen: &&&(&'a ObjectView, Disc)| (size(seen) - radius).abs() < most_off(&seen.1) * radius;
     let agreeing: Vec<&Disc> = there.iter().filter(is_as_large).map(|seen| &seen.1).collect();
     let middle = |of: fn(&Disc) -> f64| median(&mut agreeing.iter().map(|disc| of(disc)).collect::<Vec<_>>());
-    let is_whole = |seen: &&(&'a ObjectView, Disc)| shows_whole(camera(seen.0), (centre, radius));
+    let is_whole = |seen: &&(&'a ObjectView, Disc)| shows_whole(camera(seen.0), &ball);
     let are_most = agreeing.len() >= FEWEST && 2 * agreeing.len() > discs.iter().filter(is_whole).count();
     let stands = middle(|disc| disc.around) < STAND && middle(|disc| disc.share) < MOST;
-    (are_most && stands).then_some(Ball { centre, radius })
+    (are_most && stands).then_some(ball)
 }
 
 /// Share of its radius by which a disc may be off.
@@ -95,9 +96,9 @@ fn most_off(disc: &Disc) -> f64 {
 }
 
 /// True where a ball lies within a crop.
-fn shows_whole(camera: &PinholeCamera, (centre, radius): (DVec3, f64)) -> bool {
-    camera.project(centre).is_some_and(|(pixel, depth)| {
-        let reach = DVec2::splat(radius / depth * camera.focal_px.x);
+fn shows_whole(camera: &PinholeCamera, ball: &Ball) -> bool {
+    camera.project(ball.centre).is_some_and(|(pixel, depth)| {
+        let reach = DVec2::splat(ball.radius / depth * camera.focal_px.x);
         let size = DVec2::new(f64::from(camera.width), f64::from(camera.height));
         (pixel - reach).cmpge(DVec2::ZERO).all() && (pixel + reach).cmple(size).all()
     })

@@ -11,8 +11,7 @@ use rand_pcg::Pcg64;
 use super::outline::Outline;
 use super::plane::Plane;
 use super::shape::{Adam, Pose, Shape};
-use super::view::{ObjectView, Seen, is_one_camera};
-use crate::phases::Phases;
+use super::view::ObjectView;
 
 /// Rates of turns, radians, and of translations, of the size.
 const POSE_RATE: f64 = 0.02;
@@ -68,8 +67,29 @@ pub(super) struct Fit<'a> {
 pub(super) type PoseMoments = [Adam; 2];
 
 /// Moments of a pose that has not moved yet.
-pub(super) fn fresh_moments() -> PoseMoments {
+fn fresh_moments() -> PoseMoments {
     [Adam::new(3), Adam::new(3)]
+}
+
+/// A pose that moves by itself, and is not among those of a fit yet.
+pub(super) struct MovingPose {
+    pub(super) pose: Pose,
+    moments: PoseMoments,
+}
+
+impl MovingPose {
+    /// A pose before its first step.
+    pub(super) fn from(pose: Pose) -> Self {
+        Self { pose, moments: fresh_moments() }
+    }
+}
+
+/// A pose at a time.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct TimedPose {
+    /// Index of the time.
+    pub(super) time: usize,
+    pub(super) pose: Pose,
 }
 
 /// Tangent vector of a rotation, at most pi long.
@@ -78,95 +98,7 @@ pub(super) fn log(rotation: DQuat) -> DVec3 {
     rotation.to_scaled_axis()
 }
 
-/// Gaussians inside the masks of all times under some poses, within a bound in the object's frame; `None` where there
-/// are none.
-pub(super) fn hull(
-    views: &[ObjectView],
-    poses: &BTreeMap<usize, Pose>,
-    (size, bound): (f64, Option<&dyn Fn(DVec3) -> bool>),
-    count: usize,
-    (near, phases): (f32, &Phases),
-    rng: &mut Pcg64,
-) -> Option<Shape> {
-    /// Candidates, and the times that they are looked at.
-    const CANDIDATES: usize = 6000;
-    const TIMES: usize = 12;
-    let spread = (poses.len() / TIMES).max(1);
-    let all = || poses.keys().step_by(spread).flat_map(|t| views.iter().filter(|view| view.time_index == *t));
-    let mut looked: Vec<&ObjectView> = all().filter(|view| !view.cut && view.visible >= 0.6).collect();
-    if looked.is_empty() {
-        looked = all().collect();
-    }
-    let mut found: Vec<(f64, [f32; 3], [f32; 3])> = Vec::with_capacity(CANDIDATES);
-    for _ in 0..CANDIDATES {
-        let direction = loop {
-            let d = DVec3::from(std::array::from_fn(|_| rng.random::<f64>() * 2.0 - 1.0));
-            if d.length_squared() <= 1.0 {
-                break d;
-            }
-        };
-        let place = 1.25 * size * direction;
-        if bound.is_some_and(|bound| !bound(place)) {
-            continue;
-        }
-        let (mut inside, mut outside, mut color) = (0.0_f64, 0.0_f64, [0.0_f32; 3]);
-        for view in &looked {
-            let pose = &poses[&view.time_index];
-            match view.at(pose.rotation * place + pose.translation) {
-                Seen::Object(seen) => {
-                    inside += 1.0;
-                    (0..3).for_each(|k| color[k] += seen[k]);
-                }
-                Seen::Nothing => outside += 1.0,
-                Seen::Other | Seen::Outside => {}
-            }
-        }
-        let share = inside / (inside + outside).max(1.0);
-        if inside > 0.0 {
-            let color = color.map(|sum| sum / inside as f32);
-            found.push((share, place.to_array().map(|value| value as f32), color));
-        }
-    }
-    found.sort_by(|a, b| b.0.total_cmp(&a.0));
-    let good = found.iter().filter(|(share, ..)| *share > 0.8).count().max(count).min(found.len());
-    let mut taken: Vec<usize> = (0..good).collect();
-    taken.shuffle(rng);
-    taken.truncate(count);
-    let places: Vec<[f32; 3]> = taken.iter().map(|k| found[*k].1).collect();
-    let colors: Vec<[f32; 3]> = taken.iter().map(|k| found[*k].2).collect();
-    if places.len() < 8 { None } else { Shape::new(&places, &colors, size, near, phases) }
-}
-
-impl<'a> Fit<'a> {
-    pub(super) fn new(
-        views: &'a [ObjectView],
-        (plane, outline): (Option<Plane>, &'a Outline),
-        (times, near): (usize, f32),
-        poses: BTreeMap<usize, Pose>,
-        shape: Shape,
-        rng: Pcg64,
-    ) -> Self {
-        let one_camera = is_one_camera(views);
-        let (turns, rolls) = (Turns::Free, None);
-        Self {
-            views,
-            plane,
-            outline,
-            poses,
-            shape,
-            turns,
-            rolls,
-            times,
-            near,
-            one_camera,
-            rng,
-            stays: false,
-            air: outline.air.clone(),
-            moments: BTreeMap::new(),
-            runs: Vec::new(),
-        }
-    }
-
+impl Fit<'_> {
     pub(super) fn size(&self) -> f64 {
         self.outline.size()
     }
@@ -218,10 +150,11 @@ impl<'a> Fit<'a> {
         shape: &mut Shape,
         view: usize,
         level: usize,
-        (pose, moments): (&mut Pose, &mut PoseMoments),
+        moving: &mut MovingPose,
         rate: f64,
     ) {
         let view = &self.views[view];
+        let MovingPose { pose, moments } = moving;
         let mut gradient = shape.loss(&view.crops[level], pose, GREY, view.visible as f32, true).pose;
         if view.is_sliver() {
             gradient.turn = DVec3::ZERO;
@@ -240,15 +173,15 @@ impl<'a> Fit<'a> {
         shape: &mut Shape,
         views: &[usize],
         level: usize,
-        mut pose: Pose,
+        pose: Pose,
         steps: usize,
     ) -> Pose {
-        let mut moments = fresh_moments();
+        let mut moving = MovingPose::from(pose);
         for step in 0..steps {
             let rate = if step < steps / 2 { 1.0 } else { 0.3 };
-            self.pose_step(shape, views[step % views.len()], level, (&mut pose, &mut moments), rate);
+            self.pose_step(shape, views[step % views.len()], level, &mut moving, rate);
         }
-        pose
+        moving.pose
     }
 
     /// Mean loss over views, by their visible shares.
@@ -411,15 +344,16 @@ impl<'a> Fit<'a> {
 
     /// Pose at a time beyond the outermost one, beside another.
     fn beyond(&self, near: usize, far: Option<usize>, time: usize) -> Pose {
-        let last = self.poses[&near];
-        far.map_or(last, |far| onward((near, last), (far, self.poses[&far]), time))
+        let at = |time: usize| TimedPose { time, pose: self.poses[&time] };
+        far.map_or(self.poses[&near], |far| onward(at(near), at(far), time))
     }
 }
 
 /// Pose at a time where the speed between a far and a near one leads, for a few steps at most.
-pub(super) fn onward((near, last): (usize, Pose), (far, before): (usize, Pose), time: usize) -> Pose {
-    let steps = (time as f64 - near as f64) / (near as f64 - far as f64);
+pub(super) fn onward(near: TimedPose, far: TimedPose, time: usize) -> Pose {
+    let steps = (time as f64 - near.time as f64) / (near.time as f64 - far.time as f64);
     let steps = steps.clamp(-6.0, 6.0);
+    let (last, before) = (near.pose, far.pose);
     let turn = log(last.rotation * before.rotation.inverse());
     Pose {
         rotation: (DQuat::from_scaled_axis(steps * turn) * last.rotation).normalize(),

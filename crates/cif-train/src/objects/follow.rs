@@ -6,7 +6,8 @@ use glam::{DQuat, DVec3};
 use rand::RngExt;
 use rayon::prelude::*;
 
-use super::fit::{Fit, PoseMoments, fresh_moments, hull, log};
+use super::fit::{Fit, MovingPose, log};
+use super::hull::hull;
 use super::shape::Pose;
 use crate::error::TrainError;
 use crate::phases::Phases;
@@ -102,8 +103,8 @@ fn carve(fit: &mut Fit<'_>, at: &BTreeMap<usize, Vec<usize>>, steps: usize, pose
     let count = fit.shape.gaussians().len();
     let upright = fit.outline.upright(fit.plane.as_ref());
     let bound: Option<&dyn Fn(DVec3) -> bool> = if fit.outline.is_surrounded { None } else { Some(&upright) };
-    let (bounded, drawn) = ((fit.outline.size(), bound), (fit.near, &fit.shape.phases().clone()));
-    let Some(shape) = hull(fit.views, &fit.poses, bounded, count, drawn, &mut fit.rng) else { return };
+    let hull = hull(fit.views, &fit.poses, fit.outline.size(), bound, count, &mut fit.rng);
+    let Some(shape) = hull.and_then(|hull| hull.shape(fit.near, fit.shape.phases())) else { return };
     fit.shape = shape;
     let known: Vec<usize> = fit.poses.keys().flat_map(|time| at[time].iter().copied()).collect();
     let level = fit.trial_level();
@@ -185,19 +186,19 @@ fn found(fit: &Fit<'_>, time: usize, path: &BTreeMap<usize, DVec3>, views: &[usi
         tried.extend(judge(candidates.collect()).iter().take(KEPT).map(|(_, at)| *at));
     }
     let steps = if known.len() > 1 { POSE } else { 2 * POSE };
-    let mut refined: Vec<(f64, Pose, PoseMoments)> =
-        tried.into_iter().map(|at| (0.0, posed(at), fresh_moments())).collect();
+    let mut refined: Vec<(f64, MovingPose)> =
+        tried.into_iter().map(|at| (0.0, MovingPose::from(posed(at)))).collect();
     for level in levels {
         let rate = if *level > 0 || levels.len() == 1 { 1.0 } else { 0.5 };
         let moved = refined.into_par_iter().map_init(
             || fit.shape.copied(),
-            |shape, (_, mut pose, mut moments)| {
+            |shape, (_, mut moving)| {
                 for step in 0..steps {
                     let view = views[step % views.len()];
-                    fit.pose_step(shape, view, *level, (&mut pose, &mut moments), rate);
+                    fit.pose_step(shape, view, *level, &mut moving, rate);
                 }
-                let loss = views.iter().map(|view| fit.loss_with(shape, *view, *level, &pose)).sum();
-                (loss, pose, moments)
+                let loss = views.iter().map(|view| fit.loss_with(shape, *view, *level, &moving.pose)).sum();
+                (loss, moving)
             },
         );
         refined = moved.collect();
@@ -205,5 +206,5 @@ fn found(fit: &Fit<'_>, time: usize, path: &BTreeMap<usize, DVec3>, views: &[usi
         // Few pixels tell which are worth more of them.
         refined.truncate(refined.len().div_ceil(2));
     }
-    refined.first().map_or(last, |(_, pose, _)| *pose)
+    refined.first().map_or(last, |(_, moving)| moving.pose)
 }

@@ -97,7 +97,8 @@ impl KnownObjects {
     pub(crate) fn restored(
         json: Value,
         tensors: &mut BTreeMap<String, StateTensor>,
-        (instances, times): (usize, usize),
+        instances: usize,
+        times: usize,
     ) -> Option<Self> {
         let mut known: Self = serde_json::from_value(json).ok()?;
         let labels = known.rigid.keys().chain(known.parts.keys());

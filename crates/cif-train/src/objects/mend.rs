@@ -1,7 +1,7 @@
 //! Mending of poses that jump: following a few times may end on a wrong side of what they show, from which following
 //! the times behind them comes back.
 
-use super::fit::{Fit, log, onward};
+use super::fit::{Fit, TimedPose, log, onward};
 use super::shape::{Pose, Shape};
 use super::view::median;
 use crate::error::TrainError;
@@ -75,16 +75,16 @@ fn apart(a: &Pose, b: &Pose, size: f64) -> (f64, f64) {
 /// or as long as it explains them better. What looks the same from two sides never meets them, and explains all of them
 /// as well.
 fn march(fit: &mut Fit<'_>, times: &[usize], known: &[usize]) {
-    let mut run: Vec<(usize, Pose)> =
-        known.iter().take(2).rev().map(|time| (*time, fit.poses[time])).collect();
+    let at = |time: &usize| TimedPose { time: *time, pose: fit.poses[time] };
+    let mut run: Vec<TimedPose> = known.iter().take(2).rev().map(at).collect();
     let (begin, mut better) = (run.len(), run.len());
     let (mut before, mut after) = (0.0, 0.0);
     let mut is_even = false;
     for time in times.iter().copied() {
         let guesses = led(time, &run);
-        let Some((present, found, pose)) = compared(fit, time, &guesses) else {
+        let Some(Compared { present, found, pose }) = compared(fit, time, &guesses) else {
             // It does not tell: onward to those that do.
-            run.extend(guesses.last().map(|pose| (time, *pose)));
+            run.extend(guesses.last().map(|pose| TimedPose { time, pose: *pose }));
             continue;
         };
         (before, after) = (before + present, after + found);
@@ -96,7 +96,7 @@ fn march(fit: &mut Fit<'_>, times: &[usize], known: &[usize]) {
         if better == run.len() && found < GAIN * present {
             better += 1;
         }
-        run.push((time, pose));
+        run.push(TimedPose { time, pose });
         let (turn, shift) = apart(&fit.poses[&time], &pose, fit.size());
         if turn < CLOSED.0 && shift < CLOSED.1 {
             break;
@@ -106,27 +106,36 @@ fn march(fit: &mut Fit<'_>, times: &[usize], known: &[usize]) {
     if is_even {
         better = run.len();
     }
-    for (time, pose) in run.drain(..better).skip(begin) {
+    for TimedPose { time, pose } in run.drain(..better).skip(begin) {
         fit.poses.insert(time, pose);
         fit.moments.remove(&time);
     }
 }
 
 /// Poses in which a time may be where the last ones of a run lead: as the last one, and as far on as its speed leads.
-fn led(time: usize, run: &[(usize, Pose)]) -> Vec<Pose> {
+fn led(time: usize, run: &[TimedPose]) -> Vec<Pose> {
     let Some(near) = run.last() else { return Vec::new() };
     let far = run.len().checked_sub(2).map(|k| run[k]);
-    std::iter::once(near.1).chain(far.map(|far| onward(*near, far, time))).collect()
+    std::iter::once(near.pose).chain(far.map(|far| onward(*near, far, time))).collect()
 }
 
-/// Losses of a time in its present pose, and in the best of those that guesses lead to, and that pose; `None` where the
-/// time does not tell.
-fn compared(fit: &Fit<'_>, time: usize, guesses: &[Pose]) -> Option<(f64, f64, Pose)> {
+/// A time in its present pose, held against the best of others.
+struct Compared {
+    /// Loss in the present pose.
+    present: f64,
+    /// Loss in the best of the others.
+    found: f64,
+    /// The best of the others.
+    pose: Pose,
+}
+
+/// The present pose of a time held against those that guesses lead to; `None` where the time does not tell.
+fn compared(fit: &Fit<'_>, time: usize, guesses: &[Pose]) -> Option<Compared> {
     let is_told = |view: &usize| fit.views[*view].time_index == time && fit.views[*view].visible >= TOLD;
     let views: Vec<usize> = (0..fit.views.len()).filter(is_told).collect();
     let (found, pose) = settled(fit, &views, guesses, guesses.len())?;
     let present = loss(fit, &mut fit.shape.copied(), &views, fit.poses.get(&time)?);
-    Some((present, found, pose))
+    Some(Compared { present, found, pose })
 }
 
 /// The best of some poses by their loss on views of a time, which is given too, after so many of them that explain most

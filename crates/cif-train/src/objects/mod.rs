@@ -10,7 +10,9 @@
 //! | `outline`, `outlines`, `path` | how large an object is, and where it goes |
 //! | `meeting` | where rays through the middles of its masks meet |
 //! | `shape` | its Gaussians alone, against crops |
+//! | `hull` | where its Gaussians start |
 //! | `fit` | its poses and Gaussians, moved together |
+//! | `split` | which views are fitted to, and which judge |
 //! | `priors` | how it moves where pictures say little |
 //! | `texture`, `ball`, `sphere` | how it turns, where its outline does not tell |
 //! | `ways` | which ways of moving are tried |
@@ -33,6 +35,7 @@ mod discs;
 mod fit;
 mod follow;
 mod grow;
+mod hull;
 mod known;
 mod meeting;
 mod mend;
@@ -48,6 +51,7 @@ mod rotation;
 mod sequence;
 mod shape;
 mod sphere;
+mod split;
 mod start;
 #[cfg(test)]
 mod testing;
@@ -98,7 +102,7 @@ pub(crate) fn support_below(
 ) -> Result<Option<Plane>, TrainError> {
     let below = below::below(&doubles(&dataset.points.positions), dataset, frames, phases)?;
     let rng = stream(seed, Purpose::Objects, 0);
-    Ok(plane::rough_support(&below, (&cameras(dataset), up(dataset)), rng))
+    Ok(plane::rough_support(&below, &cameras(dataset), up(dataset), rng))
 }
 
 fn doubles(points: &[[f32; 3]]) -> Vec<DVec3> {
@@ -184,7 +188,7 @@ fn views_of(
     frames: &FrameStore,
     surroundings: Surroundings<'_>,
 ) -> Result<Vec<ObjectView>, TrainError> {
-    let behind = surroundings.order.behind(label);
+    let object = surroundings.order.of_label(label);
     let masks = frames.masks(dataset, surroundings.phases)?;
     let areas = masks.iter().flatten().filter_map(|table| Some(f64::from(table.rows.get(&label)?.pixels)));
     let joined = view::joined(areas.collect());
@@ -194,8 +198,7 @@ fn views_of(
         let Some(table) = table.as_ref().filter(|table| table.rows.contains_key(&label)) else { continue };
         let frame = &dataset.frames[frames.index(k)];
         let data = frames.get(dataset, k)?;
-        let seen = (&data, joined);
-        views.extend(ObjectView::new((label, &behind), frame.time_index, &frame.camera, seen, table));
+        views.extend(ObjectView::new(&object, frame.time_index, &frame.camera, &data, joined, table));
     }
     views.sort_by_key(|view| view.time_index);
     view::set_visible(&mut views);

@@ -6,7 +6,8 @@ use cif_field::tracks::RotationEvidence;
 use glam::{DQuat, DVec3};
 use rand_pcg::Pcg64;
 
-use super::fit::{Fit, hull};
+use super::fit::{Fit, Turns};
+use super::hull::hull;
 use super::meeting::meeting_point;
 use super::order::Order;
 use super::outline::Outline;
@@ -112,13 +113,41 @@ impl<'a> Object<'a> {
     /// A fit that starts with poses and a shape.
     pub(super) fn fit(&self, poses: BTreeMap<usize, Pose>, shape: Shape, rng: Pcg64) -> Fit<'a> {
         let Surroundings { plane, times, near, .. } = self.surroundings;
-        Fit::new(self.views, (plane.copied(), self.outline), (times, near), poses, shape, rng)
+        Fit {
+            views: self.views,
+            plane: plane.copied(),
+            outline: self.outline,
+            poses,
+            shape,
+            turns: Turns::Free,
+            rolls: None,
+            times,
+            near,
+            one_camera: is_one_camera(self.views),
+            rng,
+            stays: false,
+            air: self.outline.air.clone(),
+            moments: BTreeMap::new(),
+            runs: Vec::new(),
+        }
     }
 
     /// Gaussians inside the masks in poses.
     pub(super) fn hull(&self, poses: &BTreeMap<usize, Pose>, count: usize, rng: &mut Pcg64) -> Option<Shape> {
+        self.hull_within(poses, self.outline.size(), None, count, rng)
+    }
+
+    /// The same of an object of another size, metres, within a bound in its frame.
+    pub(super) fn hull_within(
+        &self,
+        poses: &BTreeMap<usize, Pose>,
+        size: f64,
+        bound: Option<&dyn Fn(DVec3) -> bool>,
+        count: usize,
+        rng: &mut Pcg64,
+    ) -> Option<Shape> {
         let Surroundings { near, phases, .. } = self.surroundings;
-        hull(self.views, poses, (self.outline.size(), None), count, (near, phases), rng)
+        hull(self.views, poses, size, bound, count, rng)?.shape(near, phases)
     }
 
     /// Of some times the one that shows most of it: the largest mask, whole if there is one.
@@ -148,9 +177,8 @@ impl<'a> Object<'a> {
             poses.extend(near.iter().take(TOGETHER).map(|time| (*time, at(path[time]))));
         }
         let upright = self.outline.upright(self.surroundings.plane);
-        let Surroundings { near, phases, .. } = self.surroundings;
-        let bounded: (f64, Option<&dyn Fn(DVec3) -> bool>) = (self.outline.size(), Some(&upright));
-        let shape = hull(self.views, &poses, bounded, FOLLOWED, (near, phases), &mut self.rng())?;
+        let size = self.outline.size();
+        let shape = self.hull_within(&poses, size, Some(&upright), FOLLOWED, &mut self.rng())?;
         let mut fit = self.fit(poses, shape, self.rng());
         fit.air = self.may_be_off(path);
         Some((reference, fit))

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use cif_dataset::Dataset;
 use cif_render::UNLABELLED;
 
-use super::view::median;
+use super::view::{ObjectLabel, median};
 use crate::error::TrainError;
 use crate::frames::FrameStore;
 use crate::mask_table::MaskTable;
@@ -61,9 +61,9 @@ impl Order {
         Self { behind: (0..labels).map(behind).collect() }
     }
 
-    /// By label (dense index + 1), true for those behind an object.
-    pub(super) fn behind(&self, label: u16) -> Arc<[bool]> {
-        Arc::clone(&self.behind[usize::from(label)])
+    /// A label (dense index + 1) with those behind it.
+    pub(super) fn of_label(&self, label: u16) -> ObjectLabel {
+        ObjectLabel { label, behind: Arc::clone(&self.behind[usize::from(label)]) }
     }
 }
 
@@ -132,9 +132,9 @@ mod tests {
     fn what_surrounds_an_object_is_behind_it_unless_it_hides_it() {
         for hides in [true, false] {
             let order = Order::among(&images(hides, [2, 2, 38, 30]), 4);
-            assert_eq!(order.behind(1)[..], [false, false, true, !hides], "{hides}");
-            assert_eq!(order.behind(2)[..], [false; 4]);
-            assert_eq!(order.behind(3)[..], [false; 4]);
+            assert_eq!(order.of_label(1).behind[..], [false, false, true, !hides], "{hides}");
+            assert_eq!(order.of_label(2).behind[..], [false; 4]);
+            assert_eq!(order.of_label(3).behind[..], [false; 4]);
         }
     }
 
@@ -142,6 +142,6 @@ mod tests {
     fn what_hides_an_object_now_and_then_is_not_behind_it() {
         let (before, after) = (images(false, [0; 4]), images(true, [0; 4]));
         let order = Order::among(&before.into_iter().chain(after).collect::<Vec<_>>(), 4);
-        assert!(!order.behind(1)[3]);
+        assert!(!order.of_label(1).behind[3]);
     }
 }

@@ -73,12 +73,11 @@ enum Stance {
 /// lower fell over: pictures decide. Where it sees the object from other sides soon after, rays that cross tell the path
 /// of what leaves the plane. `times` are those of the sequence.
 pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize) -> Vec<Outline> {
-    let on_plane = |stance: Stance| plane.and_then(|plane| on_plane(views, plane, stance));
     let met = meetings(views);
     if !met.is_empty() {
-        let on_plane = on_plane(Stance::MayLeave);
-        return vec![surrounded(views, (plane, on_plane), (met, path::MEETING))];
+        return vec![met_outline(views, plane, met)];
     }
+    let on_plane = |stance: Stance| plane.and_then(|plane| on_plane(views, plane, stance));
     let mut found: Vec<Outline> = on_plane(Stance::Stays).into_iter().collect();
     let leaves = on_plane(Stance::MayLeave).filter(|outline| !outline.air.is_empty());
     let crossing = path::crossing(views, times);
@@ -86,7 +85,7 @@ pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize
         found.extend(leaves);
     } else {
         let is_resort = !found.is_empty() && leaves.is_none();
-        let mut outline = surrounded(views, (None, None), (crossing, path::CROSSING));
+        let mut outline = around(views, crossing, path::CROSSING);
         outline.air = plane.map_or_else(Vec::new, |plane| raised(&outline, plane));
         found.push(Outline { is_resort, ..outline });
     }
@@ -94,14 +93,10 @@ pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize
     found
 }
 
-/// Outline of an object whose centres are known by time, with the stiffness of their path, beside what a plane tells.
-fn surrounded(
-    views: &[ObjectView],
-    (plane, on_plane): (Option<&Plane>, Option<Outline>),
-    (met, stiffness): (BTreeMap<usize, DVec3>, f64),
-) -> Outline {
+/// Outline of an object whose centres are known by time, with the stiffness of their path.
+fn around(views: &[ObjectView], path: BTreeMap<usize, DVec3>, stiffness: f64) -> Outline {
     let radius_of = |view: &ObjectView| {
-        let depth = view.camera.project(*met.get(&view.time_index)?)?.1;
+        let depth = view.camera.project(*path.get(&view.time_index)?)?.1;
         Some(view.reach(WITHIN) * depth / view.camera.focal_px.x)
     };
     let mut radii: Vec<f64> = views.iter().filter(|view| view.is_whole()).filter_map(radius_of).collect();
@@ -109,30 +104,34 @@ fn surrounded(
         radii = views.iter().filter_map(radius_of).collect();
     }
     let radius = median(&mut radii);
-    let mut outline = on_plane.unwrap_or_else(|| Outline {
+    Outline {
         height: radius,
         radius,
         roundness: if are_discs(views.iter()) { 1.0 } else { 0.0 },
-        path: BTreeMap::new(),
+        path,
         air: Vec::new(),
         stiffness,
         is_surrounded: true,
         held: Vec::new(),
         guessed: Vec::new(),
         is_resort: false,
-    });
-    if stiffness == path::MEETING
-        && let Some(plane) = plane
+    }
+}
+
+/// Outline of an object that several cameras see, by where their rays meet and by what a plane tells.
+fn met_outline(views: &[ObjectView], plane: Option<&Plane>, met: BTreeMap<usize, DVec3>) -> Outline {
+    let on_plane = plane.and_then(|plane| on_plane(views, plane, Stance::MayLeave));
+    let mut outline = match on_plane {
+        Some(known) => Outline { air: Vec::new(), stiffness: path::MEETING, is_surrounded: true, ..known },
+        None => around(views, met.clone(), path::MEETING),
+    };
+    if let Some(plane) = plane
         && let Some(height) = standing_height(&met, plane, outline.height)
     {
         outline.height = height;
         stand(&mut outline, views, plane, &met);
     }
-    if stiffness == path::MEETING {
-        guess(&mut outline, views, &met);
-    }
-    (outline.stiffness, outline.is_surrounded) = (stiffness, true);
-    outline.air.clear();
+    guess(&mut outline, views, &met);
     outline.path.extend(met);
     outline
 }

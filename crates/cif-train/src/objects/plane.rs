@@ -66,7 +66,7 @@ pub(super) fn support(points: &[DVec3], cameras: &[DVec3], tolerance: f64, mut r
 
 /// The plane of rough points, as structure from motion gives them; `None` where no plane has enough of them, where these
 /// lie on a line, or where nothing can stand on it.
-pub(super) fn rough_support(points: &[DVec3], (cameras, up): (&[DVec3], DVec3), rng: Pcg64) -> Option<Plane> {
+pub(super) fn rough_support(points: &[DVec3], cameras: &[DVec3], up: DVec3, rng: Pcg64) -> Option<Plane> {
     let camera = cameras.iter().sum::<DVec3>() / cameras.len().max(1) as f64;
     let tolerance =
         ROUGH * median(&mut points.iter().map(|point| point.distance(camera)).collect::<Vec<_>>());
@@ -131,14 +131,14 @@ mod tests {
         let rng = || stream(0, Purpose::Objects, 0);
         let points = rough(0.01);
         assert_eq!(support(&points, &CAMERAS, 0.002, rng()), None);
-        let plane = rough_support(&points, (&CAMERAS, DVec3::Z), rng()).unwrap();
+        let plane = rough_support(&points, &CAMERAS, DVec3::Z, rng()).unwrap();
         assert!(plane.normal.z > 0.999 && plane.height(DVec3::ZERO).abs() < 0.004, "{plane:?}");
         // A wall, a cloud, a line, and too few.
-        assert_eq!(rough_support(&points, (&CAMERAS, DVec3::Y), rng()), None);
-        assert_eq!(rough_support(&rough(0.3), (&CAMERAS, DVec3::Z), rng()), None);
+        assert_eq!(rough_support(&points, &CAMERAS, DVec3::Y, rng()), None);
+        assert_eq!(rough_support(&rough(0.3), &CAMERAS, DVec3::Z, rng()), None);
         let line: Vec<DVec3> =
             points.iter().map(|point| DVec3::new(point.x, 0.01 * point.y, point.z)).collect();
-        assert_eq!(rough_support(&line, (&CAMERAS, DVec3::Z), rng()), None);
-        assert_eq!(rough_support(&points[..50], (&CAMERAS, DVec3::Z), rng()), None);
+        assert_eq!(rough_support(&line, &CAMERAS, DVec3::Z, rng()), None);
+        assert_eq!(rough_support(&points[..50], &CAMERAS, DVec3::Z, rng()), None);
     }
 }

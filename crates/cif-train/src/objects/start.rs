@@ -20,6 +20,7 @@ use super::path::smooth;
 use super::plane::Plane;
 use super::rotation::shown;
 use super::shape::Pose;
+use super::split::{SplitViews, times_of};
 use super::trials::{self, GAUSSIANS, STEPS};
 use super::view::{ObjectView, median};
 use super::ways::{Way, rolled};
@@ -160,12 +161,10 @@ impl<'a> Object<'a> {
         let is_reliable =
             |view: &usize| views[*view].is_reliable() && !outline.guessed.contains(&views[*view].time_index);
         let reliable: Vec<usize> = self.views_at(&path).filter(is_reliable).collect();
-        let mut good: Vec<usize> = reliable.iter().map(|view| views[*view].time_index).collect();
-        good.dedup();
-        if good.len() < FEWEST_TIMES {
+        if times_of(views, &reliable).len() < FEWEST_TIMES {
             return self.followed(path);
         }
-        let found = trials::best_way(self, path.clone(), (&reliable, &good))?;
+        let found = trials::best_way(self, path.clone(), &reliable)?;
         if found.is_none() && self.comes_or_goes(&path, &reliable) {
             return self.followed(path);
         }
@@ -218,7 +217,7 @@ impl<'a> Object<'a> {
             let rotation = |time: usize| DQuat::from_axis_angle(up, angle(time).to_radians());
             path.iter().map(|(t, place)| (*t, Pose { rotation: rotation(*t), translation: *place })).collect()
         };
-        shown((self.views, self.outline.size()), poses, turning(0), RIVALS.map(turning)).is_some()
+        shown(self.views, self.outline.size(), poses, turning(0), RIVALS.map(turning)).is_some()
     }
 
     /// Error of the object bending in one place, on the views that it is fitted to.
@@ -230,7 +229,7 @@ impl<'a> Object<'a> {
         fit.turns = Turns::Given;
         fit.stays = true;
         fit.steps(views, STEPS[1], |share| (if share < 0.5 { 1.0 } else { 0.5 }, 0.0, 0));
-        Some(bend::bent(&fit, (views, views), 0))
+        Some(bend::bent(&fit, &SplitViews::whole(views.to_vec()), 0))
     }
 }
 

@@ -81,12 +81,13 @@ pub(super) fn views_of_groups(
     poses: &[Vec<(DQuat, DVec3)>],
     cameras: Cameras,
 ) -> Vec<ObjectView> {
-    views_in_masks((gaussians, group_of), poses, cameras, |labels| labels)
+    views_in_masks(gaussians, group_of, poses, cameras, |labels| labels)
 }
 
 /// The same in masks that are not exact.
 pub(super) fn views_in_masks(
-    (gaussians, group_of): (Gaussians, Vec<u32>),
+    gaussians: Gaussians,
+    group_of: Vec<u32>,
     poses: &[Vec<(DQuat, DVec3)>],
     cameras: Cameras,
     mut masks: impl FnMut(PixelGrid<u16>) -> PixelGrid<u16>,
@@ -111,7 +112,7 @@ pub(super) fn views_in_masks(
     };
     let settings = RenderSettings { sh_degree: 0, background: [0.6, 0.6, 0.55], ..RenderSettings::default() };
     let mut renderer = Renderer::new(SimdLevel::Auto);
-    let behind: Arc<[bool]> = Arc::new([false; 2]);
+    let object = Order::among(&[], 2).of_label(1);
     let mut views = Vec::new();
     for (k, camera) in (0..TIMES).flat_map(|k| cameras(k).into_iter().map(move |camera| (k, camera))) {
         let channels = Channels { depth: false, instances: false };
@@ -120,7 +121,7 @@ pub(super) fn views_in_masks(
         let bytes = image.color.map(|c| c.map(|c| (255.0 * c.clamp(0.0, 1.0)).round() as u8));
         let table = MaskTable::of(&labels);
         let frame = Arc::new(TrainFrame { image: bytes, labels: Some(labels), labelled: 0, features: None });
-        views.extend(ObjectView::new((1, &behind), k, &camera, (&frame, 1), &table));
+        views.extend(ObjectView::new(&object, k, &camera, &frame, 1, &table));
     }
     set_visible(&mut views);
     views
@@ -149,7 +150,7 @@ pub(super) fn with_objects<T>(
 }
 
 /// The outline of an object of this height and radius, and roundness, which stays on its support along a path.
-pub(super) fn shaped((height, radius): (f64, f64), roundness: f64, path: BTreeMap<usize, DVec3>) -> Outline {
+pub(super) fn shaped(height: f64, radius: f64, roundness: f64, path: BTreeMap<usize, DVec3>) -> Outline {
     Outline {
         height,
         radius,

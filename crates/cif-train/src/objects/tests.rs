@@ -15,6 +15,7 @@ use super::object::Object;
 use super::outlines;
 use super::plane::{self, Plane};
 use super::shape::Pose;
+use super::split::SplitViews;
 use super::start::{Fitted, fit_object};
 use super::testing::{
     Cameras, FLOOR, TIMES, camera, jumping, moving, patches, rig, solid, sphere_places, views,
@@ -122,7 +123,7 @@ fn rough_views(solid: Gaussians, poses: &[(DQuat, DVec3)], cameras: Cameras, mos
         moved
     };
     let groups = vec![0; solid.len()];
-    views_in_masks((solid, groups), &[poses.to_vec()], cameras, masks)
+    views_in_masks(solid, groups, &[poses.to_vec()], cameras, masks)
 }
 
 #[test]
@@ -579,10 +580,10 @@ fn what_folds_on_its_way_is_explained_by_bending_and_a_solid_is_not() {
             let shape = objects[0].hull(&poses, 150, &mut rng).unwrap();
             let mut fit = objects[0].fit(poses, shape, rng);
             let all: Vec<usize> = (0..views.len()).collect();
-            let (judged, train): (Vec<usize>, Vec<usize>) = all.iter().partition(|view| *view % 5 == 2);
+            let (left_out, train): (Vec<usize>, Vec<usize>) = all.iter().partition(|view| *view % 5 == 2);
             let level = fit.trial_level();
             fit.steps(&train, 300, |_| (1.0, 0.0, level));
-            bend::gain(&fit, (&train, &judged), level)
+            bend::gain(&fit, &SplitViews { train, left_out }, level)
         })
     };
     let (folds, stays) = (bent(0.7), bent(0.0));

@@ -2,6 +2,7 @@
 
 use std::cell::OnceCell;
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 use cif_field::tracks::RotationEvidence;
 use glam::{DQuat, DVec3};
@@ -16,6 +17,7 @@ use super::outline::Outline;
 use super::path::smooth;
 use super::rotation::{Course, Revolving, Shown, shown};
 use super::shape::Pose;
+use super::split::{SplitViews, times_of};
 use super::texture;
 use super::view::{ObjectView, are_discs};
 use super::ways::{Paths, SMALLEST_SPIN, Way, is_round};
@@ -118,140 +120,210 @@ struct Trial<'a> {
 struct Contest<'a> {
     object: Object<'a>,
     paths: Paths<'a>,
-    train: Vec<usize>,
-    left_out: Vec<usize>,
+    /// Views that show it well.
+    reliable: Vec<usize>,
+    views: SplitViews,
     /// Times of which no view is fitted to, so that their poses lie between those of others.
     between: Vec<usize>,
+}
+
+/// Trials of resting and of sliding without a turn, in numbers.
+struct Simple {
+    /// Error of resting, on the views that were left out.
+    rests: Option<f64>,
+    /// Error of sliding without a turn, on the same views.
+    slides: Option<f64>,
+    /// True where resting explains about as much as sliding.
+    stays: bool,
+    /// True where neither explains what is seen.
+    is_unexplained: bool,
+}
+
+/// A motion that is kept.
+struct Chosen {
+    way: Way,
+    rotation: RotationEvidence,
+    /// Way whose fit it is made from.
+    fitted: Way,
+    /// True where the images show its turns; `None` where that was not asked yet.
+    is_shown: Option<bool>,
 }
 
 /// The best way of moving of an object that is seen well at enough times; `None` where it rests.
 pub(super) fn best_way<'a>(
     object: Object<'a>,
     path: BTreeMap<usize, DVec3>,
-    (reliable, good): (&[usize], &[usize]),
+    reliable: &[usize],
 ) -> Result<Option<Started<'a>>, TrainError> {
-    let Object { views, outline, surroundings, .. } = object;
-    let raw: BTreeMap<usize, DVec3> = good.iter().map(|time| (*time, outline.path[time])).collect();
-    let along = smooth(&raw, views, surroundings.times, outline);
-    let reference = object.best_seen(good.iter().copied()).unwrap_or(good[0]);
-    let (train, left_out) = split(views, reliable, good);
-    let is_trained = |time: usize| train.iter().any(|view| views[*view].time_index == time);
-    let between = left_out.iter().map(|view| views[*view].time_index).filter(|time| !is_trained(*time));
-    let mut contest = Contest {
-        object,
-        between: between.collect(),
-        paths: Paths {
-            place: object.resting_place(reliable).unwrap_or(along[&reference]),
-            along,
-            outline,
-            up: surroundings.plane.map_or(surroundings.up, |plane| plane.normal),
-            stands: surroundings.plane.is_some(),
-            reference,
-            followed: None,
-            off: Vec::new(),
-            turned: None,
-        },
-        train,
-        left_out,
-    };
-    let simple = contest.simple()?;
-    let simple_errors = [Way::Rest, Way::Slide(0)].map(|way| error_of(&simple, way));
-    let stays = rests(&simple, Way::Slide(0), REST_GAIN[0]);
-    let is_unexplained = contest.is_unexplained(&simple);
-    let may_deform = !object.is_told && outline.roundness < 1.0 && (!stays || is_unexplained);
-    let resting =
-        simple.iter().find(|trial| may_deform && trial.way == Way::Rest).map(|Trial { fit, .. }| {
-            (object.fit(fit.poses.clone(), fit.shape.copied(), fit.rng.clone()), fit.trial_level())
-        });
-    let trials = if let Some(textured) = contest.textured(&simple, (reliable, stays))? {
-        vec![textured]
-    } else if object.is_told {
-        contest.along_the_path(simple)?
-    } else if stays && !is_unexplained {
-        if !contest.paths.may_turn_unseen(views) {
-            return Ok(None);
-        }
-        contest.finely(&contest.paths.spins())?
-    } else if contest.paths.shifts() || is_unexplained {
-        contest.along_the_path(simple)?
-    } else {
+    let mut contest = Contest::new(object, reliable);
+    let trials = contest.simple()?;
+    let simple = contest.judged_simple(&trials);
+    let resting = contest.bendable(&trials, &simple);
+    let Some(trials) = contest.worthwhile(trials, &simple)? else { return Ok(None) };
+    let Some(chosen) = contest.chosen(&trials) else { return Ok(None) };
+    let Some(Trial { mut fit, losses: [_, error], .. }) =
+        trials.into_iter().find(|trial| trial.way == chosen.fitted)
+    else {
         return Ok(None);
     };
-    let followed = trials.iter().find(|trial| trial.way == Way::Followed);
-    let shown = OnceCell::new();
-    let is_shown = || {
-        *shown.get_or_init(|| {
-            followed.is_some_and(|followed| contest.shows(Way::Followed, &followed.fit.poses))
-        })
-    };
-    let moves = decide(&meant(errors(&trials), outline, is_shown), outline)
-        .filter(|(way, _)| object.is_told || !rests(&trials, *way, REST_GAIN[1]));
-    let Some((way, rotation)) = moves else { return Ok(None) };
-    if rotation == RotationEvidence::Assumed && !object.is_told && !turns(|way| error_of(&trials, way), way) {
-        return Ok(None);
-    }
-    // The path of a ball whose turn does not show is best where none is looked for; its rolling is put on afterwards.
-    let rolls_unseen = rotation == RotationEvidence::Assumed && matches!(way, Way::Roll(_));
-    let slides = error_of(&trials, Way::Slide(0)).is_some();
-    let kept = if rolls_unseen && slides { Way::Slide(0) } else { way };
-    let Some(Trial { mut fit, losses, .. }) = trials.into_iter().find(|trial| trial.way == kept) else {
-        return Ok(None);
-    };
-    let views_of_trials = (&contest.train[..], contest.judged());
-    if simple_errors[0].is_some_and(|rests| rests <= BENT_AWAY * losses[1])
+    if simple.rests.is_some_and(|rests| rests <= BENT_AWAY * error)
         && let Some((fit, level)) = resting
-        && bend::bent(&fit, views_of_trials, level) <= BENDS_IN_PLACE * losses[1]
+        && bend::bent(&fit, &contest.views, level) <= BENDS_IN_PLACE * error
     {
         return Ok(None);
     }
-    let may_bend = !object.is_told && way != Way::Lies;
-    let bent =
-        (losses[1] > DOUBTED && may_bend).then(|| bend::gain(&fit, views_of_trials, fit.trial_level()));
-    // What stays in place and looks otherwise in every turn deforms, or opens. Of thin things the outline, which is never
-    // exact, is most of what is seen: they are solid where bending explains no more.
-    let most = match simple_errors[0] {
-        _ if matches!(way, Way::Spin(_)) => MOST_IN_PLACE,
-        Some(rests) if stays && is_unexplained => EXPLAINED * rests,
-        _ => f64::INFINITY,
-    };
-    let may_be_solid = !outline.is_surrounded
-        && !matches!(way, Way::Spin(_))
-        && bent.is_some_and(|bent| bent >= BENDS_NO_BETTER);
-    if losses[1] > most && !object.is_told && !may_be_solid {
+    let may_bend = !object.is_told && chosen.way != Way::Lies;
+    let bent = (error > DOUBTED && may_bend).then(|| bend::gain(&fit, &contest.views, fit.trial_level()));
+    if contest.deforms(chosen.way, error, bent, &simple) {
         return Ok(None);
     }
-    if rotation == RotationEvidence::Assumed && kept == Way::Slide(0) && is_round(outline) {
-        fit.poses.values_mut().for_each(|pose| pose.rotation = DQuat::IDENTITY);
-    }
-    (fit.turns, fit.rolls) = match (rotation, way) {
-        (RotationEvidence::Assumed, Way::Roll(_)) => (Turns::Free, None),
-        (RotationEvidence::Assumed, _) => (Turns::Given, None),
-        (_, Way::Roll(factor)) => (Turns::Free, Some(outline.height / factor)),
-        // Light, which stays where it is, would pull it back.
-        (_, Way::Textured | Way::Lies) => (Turns::Given, None),
-        _ => (Turns::Free, None),
-    };
-    let unturned = simple_errors[1];
+    contest.hold(&mut fit, &chosen);
+    let Chosen { way, rotation, .. } = chosen;
+    let unturned = simple.slides;
     let is_turned = rotation == RotationEvidence::Observed;
-    let is_shown = match shown.get() {
-        Some(is_shown) if way == Way::Followed => *is_shown,
+    let is_shown = match chosen.is_shown {
+        Some(is_shown) if way == Way::Followed => is_shown,
         _ => contest.shows(way, &fit.poses),
     };
     let rotation = if is_shown { rotation } else { RotationEvidence::Assumed };
     // Light, which stays where it is, argues against rolling: how rigid it is shows where it does not turn, too.
-    let error = unturned.filter(|_| way == Way::Lies).map_or(losses[1], |unturned| unturned.min(losses[1]));
+    let error = unturned.filter(|_| way == Way::Lies).map_or(error, |unturned| unturned.min(error));
+    let reference = contest.paths.reference;
     Ok(Some(Started { fit, path, way, rotation, is_turned, error, unturned, bent, reference }))
 }
 
 impl<'a> Contest<'a> {
+    /// A contest over the views that show an object well, in the order of times.
+    fn new(object: Object<'a>, reliable: &[usize]) -> Self {
+        let Object { views, outline, surroundings, .. } = object;
+        let good = times_of(views, reliable);
+        let raw: BTreeMap<usize, DVec3> = good.iter().map(|time| (*time, outline.path[time])).collect();
+        let along = smooth(&raw, views, surroundings.times, outline);
+        let reference = object.best_seen(good.iter().copied()).unwrap_or(good[0]);
+        let split = SplitViews::of(views, reliable);
+        let is_trained = |time: usize| split.train.iter().any(|view| views[*view].time_index == time);
+        let left_out = split.left_out.iter().map(|view| views[*view].time_index);
+        Self {
+            object,
+            between: left_out.filter(|time| !is_trained(*time)).collect(),
+            paths: Paths {
+                place: object.resting_place(reliable).unwrap_or(along[&reference]),
+                along,
+                outline,
+                up: surroundings.plane.map_or(surroundings.up, |plane| plane.normal),
+                stands: surroundings.plane.is_some(),
+                reference,
+                followed: None,
+                off: Vec::new(),
+                turned: None,
+            },
+            reliable: reliable.to_vec(),
+            views: split,
+        }
+    }
+
+    /// The simple trials in numbers.
+    fn judged_simple(&self, trials: &[Trial<'_>]) -> Simple {
+        Simple {
+            rests: error_of(trials, Way::Rest),
+            slides: error_of(trials, Way::Slide(0)),
+            stays: rests(trials, Way::Slide(0), REST_GAIN[0]),
+            is_unexplained: self.is_unexplained(trials),
+        }
+    }
+
+    /// The fit at rest, with the level of its trial, of an object that may deform in place.
+    fn bendable(&self, trials: &[Trial<'a>], simple: &Simple) -> Option<(Fit<'a>, usize)> {
+        let object = self.object;
+        let may_deform =
+            !object.is_told && object.outline.roundness < 1.0 && (!simple.stays || simple.is_unexplained);
+        let Trial { fit, .. } = trials.iter().find(|trial| may_deform && trial.way == Way::Rest)?;
+        Some((object.fit(fit.poses.clone(), fit.shape.copied(), fit.rng.clone()), fit.trial_level()))
+    }
+
+    /// Trials of the ways that may explain what the simple ones, which are given, do not; `None` where it rests.
+    fn worthwhile(
+        &mut self,
+        trials: Vec<Trial<'a>>,
+        simple: &Simple,
+    ) -> Result<Option<Vec<Trial<'a>>>, TrainError> {
+        let Simple { stays, is_unexplained, .. } = *simple;
+        if let Some(textured) = self.textured(&trials, stays)? {
+            return Ok(Some(vec![textured]));
+        }
+        if self.object.is_told {
+            return self.along_the_path(trials).map(Some);
+        }
+        if stays && !is_unexplained {
+            let may_turn = self.paths.may_turn_unseen(self.object.views);
+            return may_turn.then(|| self.finely(&self.paths.spins())).transpose();
+        }
+        let moves = self.paths.shifts() || is_unexplained;
+        moves.then(|| self.along_the_path(trials)).transpose()
+    }
+
+    /// The motion that explains most of what trials were judged by; `None` where it rests.
+    fn chosen(&self, trials: &[Trial<'_>]) -> Option<Chosen> {
+        let Object { outline, is_told, .. } = self.object;
+        let followed = trials.iter().find(|trial| trial.way == Way::Followed);
+        let shown = OnceCell::new();
+        let is_shown = || {
+            *shown.get_or_init(|| {
+                followed.is_some_and(|followed| self.shows(Way::Followed, &followed.fit.poses))
+            })
+        };
+        let (way, rotation) = decide(&meant(errors(trials), outline, is_shown), outline)
+            .filter(|(way, _)| is_told || !rests(trials, *way, REST_GAIN[1]))?;
+        if rotation == RotationEvidence::Assumed && !is_told && !turns(|way| error_of(trials, way), way) {
+            return None;
+        }
+        // The path of a ball whose turn does not show is best where none is looked for; its rolling is put on afterwards.
+        let rolls_unseen = rotation == RotationEvidence::Assumed && matches!(way, Way::Roll(_));
+        let slides = error_of(trials, Way::Slide(0)).is_some();
+        let fitted = if rolls_unseen && slides { Way::Slide(0) } else { way };
+        Some(Chosen { way, rotation, fitted, is_shown: shown.get().copied() })
+    }
+
+    /// True where an object deforms, or opens: it stays in place, and looks otherwise in every turn.
+    fn deforms(&self, way: Way, error: f64, bent: Option<f64>, simple: &Simple) -> bool {
+        let most = match simple.rests {
+            _ if matches!(way, Way::Spin(_)) => MOST_IN_PLACE,
+            Some(rests) if simple.stays && simple.is_unexplained => EXPLAINED * rests,
+            _ => f64::INFINITY,
+        };
+        // Of thin things the outline, which is never exact, is most of what is seen: they are solid where bending explains
+        // no more.
+        let may_be_solid = !self.object.outline.is_surrounded
+            && !matches!(way, Way::Spin(_))
+            && bent.is_some_and(|bent| bent >= BENDS_NO_BETTER);
+        error > most && !self.object.is_told && !may_be_solid
+    }
+
+    /// Holds the turns of a fit to what is known of them.
+    fn hold(&self, fit: &mut Fit<'_>, chosen: &Chosen) {
+        let outline = self.object.outline;
+        let Chosen { way, rotation, fitted, .. } = *chosen;
+        if rotation == RotationEvidence::Assumed && fitted == Way::Slide(0) && is_round(outline) {
+            fit.poses.values_mut().for_each(|pose| pose.rotation = DQuat::IDENTITY);
+        }
+        (fit.turns, fit.rolls) = match (rotation, way) {
+            (RotationEvidence::Assumed, Way::Roll(_)) => (Turns::Free, None),
+            (RotationEvidence::Assumed, _) => (Turns::Given, None),
+            (_, Way::Roll(factor)) => (Turns::Free, Some(outline.height / factor)),
+            // Light, which stays where it is, would pull it back.
+            (_, Way::Textured | Way::Lies) => (Turns::Given, None),
+            _ => (Turns::Free, None),
+        };
+    }
+
     /// True where the images show the turns of the poses of a way, and not those of any that differs.
     fn shows(&self, way: Way, poses: &Course) -> bool {
-        let (paths, seen) = (&self.paths, (self.object.views, self.object.outline.size()));
+        let (paths, size) = (&self.paths, self.object.outline.size());
         let rivals = paths.ways().into_iter().chain(paths.spins()).map(|way| paths.poses(way));
         // Paths have their turns among the ways.
         let twisted = if way == Way::Followed { paths.twisted(poses) } else { Vec::new() };
         let rivals = rivals.chain(twisted);
-        match shown(seen, poses, paths.poses(Way::Slide(0)), rivals) {
+        match shown(self.object.views, size, poses, paths.poses(Way::Slide(0)), rivals) {
             Some(Shown::Turn) => true,
             Some(Shown::NoTurn) => !paths.may_roll(),
             None => false,
@@ -261,21 +333,17 @@ impl<'a> Contest<'a> {
     /// Trials of resting, and of moving along the path without a turn: most objects that do not travel rest.
     fn simple(&self) -> Result<Vec<Trial<'a>>, TrainError> {
         let mut trials = self.begin(&[Way::Rest, Way::Slide(0)], GAUSSIANS);
-        self.advance(&mut trials, (0, STEPS[1]), false)?;
+        self.advance(&mut trials, 0..STEPS[1], false)?;
         self.judge(&mut trials, false);
         Ok(trials)
     }
 
     /// Turning as texture shows, where it does and the outline says nothing else, or rolling of what lies on its side.
-    fn textured(
-        &mut self,
-        simple: &[Trial<'_>],
-        (reliable, stays): (&[usize], bool),
-    ) -> Result<Option<Trial<'a>>, TrainError> {
-        let Some((way, poses)) = self.turned(simple, (reliable, stays)) else { return Ok(None) };
+    fn textured(&mut self, simple: &[Trial<'_>], stays: bool) -> Result<Option<Trial<'a>>, TrainError> {
+        let Some((way, poses)) = self.turned(simple, stays) else { return Ok(None) };
         self.paths.turned = Some(poses);
         let mut trials = self.begin(&[way], GAUSSIANS);
-        self.advance(&mut trials, (0, STEPS[1]), false)?;
+        self.advance(&mut trials, 0..STEPS[1], false)?;
         self.judge(&mut trials, false);
         let least = simple.iter().map(|trial| trial.losses[1]).fold(f64::INFINITY, f64::min);
         let is_kept = |error: f64| way == Way::Lies || error <= TEXTURE_GAIN * least;
@@ -283,13 +351,9 @@ impl<'a> Contest<'a> {
     }
 
     /// Poses of rolling of what lies, or with turns that its texture shows.
-    fn turned(
-        &self,
-        simple: &[Trial<'_>],
-        (reliable, stays): (&[usize], bool),
-    ) -> Option<(Way, BTreeMap<usize, Pose>)> {
+    fn turned(&self, simple: &[Trial<'_>], stays: bool) -> Option<(Way, BTreeMap<usize, Pose>)> {
         let (outline, paths) = (self.object.outline, &self.paths);
-        let seen: Vec<&ObjectView> = reliable.iter().map(|view| &self.object.views[*view]).collect();
+        let seen: Vec<&ObjectView> = self.reliable.iter().map(|view| &self.object.views[*view]).collect();
         if !stays && let Some(lying) = self.lying(simple, &seen) {
             return Some((Way::Lies, lying));
         }
@@ -315,7 +379,8 @@ impl<'a> Contest<'a> {
             seen.iter().copied(),
             self.object.outline.size(),
             &slides.fit.poses,
-            (self.paths.up, height),
+            self.paths.up,
+            height,
         )?;
         let axis = self.paths.across()?;
         let covered = revolving.covered(axis);
@@ -343,13 +408,13 @@ impl<'a> Contest<'a> {
         let followed = |air: Option<Vec<usize>>| -> Result<Option<Fit<'a>>, TrainError> {
             let Some((reference, mut fit)) = object.first(along, known) else { return Ok(None) };
             fit.air = air.unwrap_or(fit.air);
-            follow(&mut fit, reference, along, &self.train, object.surroundings.phases)?;
+            follow(&mut fit, reference, along, &self.views.train, object.surroundings.phases)?;
             Ok(Some(fit))
         };
         let Some(mut on) = followed(None)? else { return Ok(None) };
         let rests: Vec<usize> = object.rests(along).into_iter().flatten().collect();
         let (resting, moving): (Vec<usize>, Vec<usize>) =
-            self.train.iter().partition(|view| rests.contains(&object.views[**view].time_index));
+            self.views.train.iter().partition(|view| rests.contains(&object.views[**view].time_index));
         if resting.is_empty() || !on.air.is_empty() || !on.is_held() {
             return Ok(Some(on));
         }
@@ -368,9 +433,7 @@ impl<'a> Contest<'a> {
     fn along_the_path(&mut self, simple: Vec<Trial<'a>>) -> Result<Vec<Trial<'a>>, TrainError> {
         let mut trials = simple;
         if self.may_be_followed() {
-            let mut known: Vec<usize> =
-                self.train.iter().map(|view| self.object.views[*view].time_index).collect();
-            known.dedup();
+            let known = times_of(self.object.views, &self.views.train);
             if let Some(fit) = self.follow(&known)? {
                 (self.paths.followed, self.paths.off) = (Some(fit.poses), fit.air);
             }
@@ -381,9 +444,9 @@ impl<'a> Contest<'a> {
             self.paths.ways()
         };
         let mut more = self.begin(&ways, GAUSSIANS);
-        self.advance(&mut more, (0, STEPS[0]), false)?;
+        self.advance(&mut more, 0..STEPS[0], false)?;
         give_up_hopeless(&mut more, |way| matches!(way, Way::Followed | Way::Roll(_)));
-        self.advance(&mut more, (STEPS[0], STEPS[1]), false)?;
+        self.advance(&mut more, STEPS[0]..STEPS[1], false)?;
         self.judge(&mut more, false);
         trials.extend(more);
         let rivals = rivals(&trials);
@@ -398,9 +461,9 @@ impl<'a> Contest<'a> {
     fn finely(&self, ways: &[Way]) -> Result<Vec<Trial<'a>>, TrainError> {
         let mut trials = self.begin(ways, FINE.0);
         let early = FINE.1 / 3;
-        self.advance(&mut trials, (0, early), true)?;
+        self.advance(&mut trials, 0..early, true)?;
         give_up_hopeless(&mut trials, |way| way == Way::Rest);
-        self.advance(&mut trials, (early, FINE.1), true)?;
+        self.advance(&mut trials, early..FINE.1, true)?;
         self.judge(&mut trials, true);
         Ok(trials)
     }
@@ -429,23 +492,18 @@ impl<'a> Contest<'a> {
         ways.par_iter().filter_map(begin).collect()
     }
 
-    /// Steps of all trials, from one count to another.
-    fn advance(
-        &self,
-        trials: &mut [Trial<'a>],
-        (from, to): (usize, usize),
-        finely: bool,
-    ) -> Result<(), TrainError> {
+    /// A range of the steps of all trials.
+    fn advance(&self, trials: &mut [Trial<'a>], steps: Range<usize>, finely: bool) -> Result<(), TrainError> {
         let all = if finely { FINE.1 } else { STEPS[1] };
         trials.par_iter_mut().for_each(|trial| {
             let level = if finely { 0 } else { trial.fit.trial_level() };
             let moves = if trial.way == Way::Rest { 0.0 } else { 1.0 };
-            trial.fit.steps(&self.train, to - from, |share| {
-                let done = from as f64 + share * (to - from) as f64;
+            trial.fit.steps(&self.views.train, steps.len(), |share| {
+                let done = steps.start as f64 + share * steps.len() as f64;
                 let rate = if done < 0.5 * all as f64 { 1.0 } else { 0.5 };
                 (rate, moves * rate, level)
             });
-            trial.losses[0] = trial.fit.mean_loss(&self.train, level);
+            trial.losses[0] = trial.fit.mean_loss(&self.views.train, level);
         });
         self.object.surroundings.phases.check()
     }
@@ -454,17 +512,13 @@ impl<'a> Contest<'a> {
     /// object turns more than its neighbours tell, and how it looks from there is what is judged.
     fn settle(&self, fit: &mut Fit<'_>, level: usize) {
         let mut shape = fit.shape.copied();
-        for view in self.left_out.iter().filter(|view| self.between.contains(&fit.views[**view].time_index)) {
+        let is_between = |view: &&usize| self.between.contains(&self.object.views[**view].time_index);
+        for view in self.views.left_out.iter().filter(is_between) {
             let time = fit.views[*view].time_index;
             let Some(pose) = fit.poses.get(&time).copied() else { continue };
             let pose = fit.settled(&mut shape, &[*view], level, pose, SETTLE);
             fit.poses.insert(time, pose);
         }
-    }
-
-    /// Views that were left out, or all where none were.
-    fn judged(&self) -> &[usize] {
-        if self.left_out.is_empty() { &self.train } else { &self.left_out }
     }
 
     /// Losses on the views that were left out.
@@ -479,7 +533,7 @@ impl<'a> Contest<'a> {
             if self.may_be_followed() && trial.way != Way::Rest {
                 self.settle(&mut trial.fit, level);
             }
-            trial.losses[1] = trial.fit.mean_loss(self.judged(), level);
+            trial.losses[1] = trial.fit.mean_loss(self.views.judged(), level);
         });
     }
 }
@@ -488,23 +542,6 @@ impl<'a> Contest<'a> {
 fn give_up_hopeless(trials: &mut Vec<Trial<'_>>, is_kept: impl Fn(Way) -> bool) {
     let best = trials.iter().map(|trial| trial.losses[0]).fold(f64::INFINITY, f64::min);
     trials.retain(|trial| trial.losses[0] <= HOPELESS * best || is_kept(trial.way));
-}
-
-/// Views to fit to, and views left out: a camera in the middle where there are several at a time, else every fourth
-/// time.
-pub(super) fn split(views: &[ObjectView], reliable: &[usize], good: &[usize]) -> (Vec<usize>, Vec<usize>) {
-    if reliable.len() > good.len() {
-        let mut cameras: Vec<[i64; 3]> = reliable.iter().map(|view| views[*view].camera_key).collect();
-        cameras.sort_unstable();
-        cameras.dedup();
-        let middle = cameras[cameras.len() / 2];
-        return reliable.iter().partition(|view| views[**view].camera_key != middle);
-    }
-    let is_left_out = |time: usize| {
-        let place = good.iter().position(|other| *other == time).unwrap_or(0);
-        good.len() > 8 && place >= 2 && place + 1 < good.len() && (place - 2).is_multiple_of(4)
-    };
-    reliable.iter().partition(|view| !is_left_out(views[**view].time_index))
 }
 
 /// Ways that are near the best: paths, rolls, and what following found.
@@ -626,7 +663,7 @@ mod tests {
     fn turns_that_nothing_tells_are_assumed() {
         let outline = |roundness: f64, air: Vec<usize>| Outline {
             air,
-            ..shaped((0.05, 0.05), roundness, BTreeMap::new())
+            ..shaped(0.05, 0.05, roundness, BTreeMap::new())
         };
         let slides = [(Way::Slide(0), 0.1), (Way::Slide(90), 0.101)];
         let with = |more: &[(Way, f64)]| [&slides[..], more].concat();
@@ -661,7 +698,7 @@ mod tests {
             (Way::Roll(1.0), 0.0865),
             (Way::Followed, 0.0557),
         ];
-        let outline = |roundness: f64| shaped((0.035, 0.035), roundness, BTreeMap::new());
+        let outline = |roundness: f64| shaped(0.035, 0.035, roundness, BTreeMap::new());
         let decided = |roundness: f64, is_shown: bool| {
             let outline = outline(roundness);
             decide(&meant(tried.clone(), &outline, || is_shown), &outline)

@@ -6,10 +6,10 @@ use std::sync::Arc;
 
 use cif_geometry::{PinholeCamera, PixelGrid, stats};
 use cif_render::{RenderSettings, UNLABELLED};
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 
 use crate::frames::TrainFrame;
-use crate::mask_table::MaskTable;
+use crate::mask_table::{MaskRow, MaskTable};
 use crate::tracks::distance_to_ray;
 
 /// Pixels around the mask that belong to its crop.
@@ -39,6 +39,22 @@ const SAME: (f64, f64) = (0.02, 0.05);
 
 /// Share of a whole mask in the disc around its middle from which it is that of a ball.
 const DISC: f64 = 0.9;
+
+/// The label of an object among those of all masks.
+#[derive(Clone)]
+pub(super) struct ObjectLabel {
+    /// Dense index + 1.
+    pub(super) label: u16,
+    /// By label, true for those that cannot hide the object.
+    pub(super) behind: Arc<[bool]>,
+}
+
+impl ObjectLabel {
+    /// True for a label that cannot hide the object: what nobody labelled, or what lies behind it.
+    pub(super) fn is_before(&self, other: u16) -> bool {
+        other == UNLABELLED || self.behind[usize::from(other)]
+    }
+}
 
 /// The crop at a resolution.
 pub(super) struct Crop {
@@ -77,9 +93,7 @@ pub(super) struct ObjectView {
     pub(super) crops: [Crop; 3],
     /// Pixels of the image across one of the finest crop.
     joined: u32,
-    label: u16,
-    /// By label, true for those that cannot hide it.
-    behind: Arc<[bool]>,
+    label: ObjectLabel,
     frame: Arc<TrainFrame>,
 }
 
@@ -97,40 +111,39 @@ pub(super) enum Seen {
 }
 
 impl ObjectView {
-    /// The view of a label (dense index + 1), with the labels that are behind it, in a frame with its masks, so many of its
-    /// pixels joined to one of the finest crop across; `None` where the masks show too little of it.
+    /// The view of an object in a frame with its masks, so many of its pixels joined to one of the finest crop across;
+    /// `None` where the masks show too little of it.
     pub(super) fn new(
-        (label, behind): (u16, &Arc<[bool]>),
+        object: &ObjectLabel,
         time_index: usize,
         camera: &PinholeCamera,
-        (frame, joined): (&Arc<TrainFrame>, u32),
+        frame: &Arc<TrainFrame>,
+        joined: u32,
         table: &MaskTable,
     ) -> Option<Self> {
-        let (labels, colors) = (frame.labels.as_ref()?, &frame.image);
-        let (width, height) = (labels.width, labels.height);
+        let labels = frame.labels.as_ref()?;
+        let label = object.label;
         let row = table.rows.get(&label).filter(|row| row.pixels >= FEWEST_PIXELS)?;
-        let (low, high) = (row.low, row.high);
+        let MaskRow { low, high, .. } = row;
         let in_box = (low[1]..=high[1]).flat_map(|y| (low[0]..=high[0]).map(move |x| [x, y]));
         let pixels: Vec<[u32; 2]> = in_box.filter(|[x, y]| *labels.at(*x, *y) == label).collect();
         let ring: u32 = row.touches.values().sum();
-        let hiding = row.touches.iter().filter(|(other, _)| !is_behind(behind, **other));
+        let hiding = row.touches.iter().filter(|(other, _)| !object.is_before(**other));
         let touching: u32 = hiding.map(|(_, sides)| sides).sum();
         let centre = camera.centre();
         Some(Self {
             time_index,
             camera_key: (centre * 1e4).round().to_array().map(|value| value as i64),
             camera: *camera,
-            size: [width, height],
+            size: [labels.width, labels.height],
             centroid: row.centroid(),
             cut: row.is_cut(),
             touched: f64::from(touching) / f64::from(ring.max(1)),
             visible: 1.0,
-            crops: [1, 2, 4]
-                .map(|more| crop(joined * more, (label, behind), camera, (low, high), labels, colors)),
+            crops: [1, 2, 4].map(|more| crop(joined * more, object, camera, row, labels, &frame.image)),
             joined,
             pixels,
-            label,
-            behind: Arc::clone(behind),
+            label: object.clone(),
             frame: Arc::clone(frame),
         })
     }
@@ -156,7 +169,7 @@ impl ObjectView {
     }
 
     /// Distance of a point of the world from the ray through the middle of the mask, metres.
-    pub(super) fn distance(&self, point: glam::DVec3) -> f64 {
+    pub(super) fn distance(&self, point: DVec3) -> f64 {
         distance_to_ray(&self.camera, self.centroid, point)
     }
 
@@ -198,13 +211,13 @@ impl ObjectView {
     }
 
     /// Finding where a point of the world is seen.
-    pub(super) fn at(&self, point: glam::DVec3) -> Seen {
+    pub(super) fn at(&self, point: DVec3) -> Seen {
         let Some([x, y]) = self.camera.pixel_of(point) else { return Seen::Outside };
         match self.frame.labels.as_ref().map_or(UNLABELLED, |labels| *labels.at(x, y)) {
-            label if label == self.label => {
+            label if label == self.label.label => {
                 Seen::Object(self.frame.image.at(x, y).map(|c| f32::from(c) / 255.0))
             }
-            other if is_behind(&self.behind, other) => Seen::Nothing,
+            other if self.label.is_before(other) => Seen::Nothing,
             _ => Seen::Other,
         }
     }
@@ -215,11 +228,6 @@ pub(super) fn joined(mut areas: Vec<f64>) -> u32 {
     let area = median(&mut areas);
     let wide_enough = |joined: &u32| area <= MOST_PIXELS * f64::from(joined * joined);
     (0..u32::BITS / 2).map(|k| 1 << k).find(wide_enough).unwrap_or(1)
-}
-
-/// True for a label that cannot hide the object: what nobody labelled, or what lies behind it.
-fn is_behind(behind: &[bool], label: u16) -> bool {
-    label == UNLABELLED || behind[usize::from(label)]
 }
 
 /// Sets the visible shares of views, which are in the order of times: each camera that stays in place is compared
@@ -275,16 +283,18 @@ pub(super) fn median(values: &mut [f64]) -> f64 {
     stats::median(values).unwrap_or(0.0)
 }
 
+/// The crop around the mask of an object, reduced by a factor.
 fn crop(
     factor: u32,
-    (label, behind): (u16, &[bool]),
+    object: &ObjectLabel,
     camera: &PinholeCamera,
-    (low, high): ([u32; 2], [u32; 2]),
+    mask_row: &MaskRow,
     labels: &PixelGrid<u16>,
     colors: &PixelGrid<[u8; 3]>,
 ) -> Crop {
     let margin = MARGIN.max(2 * factor);
     let sizes = [labels.width, labels.height];
+    let MaskRow { low, high, .. } = mask_row;
     let first = [0, 1].map(|axis| low[axis].saturating_sub(margin) / factor * factor);
     let size = [0, 1].map(|axis| {
         let end = ((high[axis] + 1 + margin).div_ceil(factor) * factor).min(sizes[axis]);
@@ -298,11 +308,11 @@ fn crop(
             for y in first[1] + row * factor..(first[1] + (row + 1) * factor).min(sizes[1]) {
                 for x in first[0] + column * factor..(first[0] + (column + 1) * factor).min(sizes[0]) {
                     let found = *labels.at(x, y);
-                    if found == label {
+                    if found == object.label {
                         own += 1.0;
                         let color = colors.at(x, y);
                         (0..3).for_each(|k| sum[k] += f32::from(color[k]) / 255.0);
-                    } else if !is_behind(behind, found) {
+                    } else if !object.is_before(found) {
                         other += 1.0;
                     }
                 }

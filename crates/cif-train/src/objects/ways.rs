@@ -281,7 +281,7 @@ mod tests {
     #[test]
     fn poses_are_twisted_about_the_upright_axis_of_the_object() {
         let along: BTreeMap<usize, DVec3> = (0..11).map(|k| (k, DVec3::X * (0.02 * k as f64))).collect();
-        let outline = shaped((0.1, 0.03), 0.8, along.clone());
+        let outline = shaped(0.1, 0.03, 0.8, along.clone());
         let paths = paths(&along, &outline);
         // It is tilted on its way.
         let tilted = |k: usize| DQuat::from_rotation_y(0.05 * k as f64);
@@ -322,7 +322,7 @@ mod tests {
     fn what_is_tall_slides_and_what_is_low_may_roll() {
         let along: BTreeMap<usize, DVec3> = (0..20).map(|k| (k, DVec3::X * (0.02 * k as f64))).collect();
         let rolls = |height: f64, radius: f64| {
-            let outline = shaped((height, radius), 0.85, along.clone());
+            let outline = shaped(height, radius, 0.85, along.clone());
             paths(&along, &outline).ways().iter().any(|way| matches!(way, Way::Roll(_)))
         };
         assert!(rolls(0.03, 0.1) && rolls(0.05, 0.04));

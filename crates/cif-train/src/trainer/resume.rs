@@ -253,8 +253,9 @@ impl Trainer {
         trainer.restore_guidance(&mut tensors)?;
         trainer.restore_poses(&mut tensors)?;
         if let Some(objects) = state.objects {
-            let counts = (trainer.state.field.instances.len(), trainer.state.dataset.times.len());
-            trainer.state.objects = KnownObjects::restored(objects, &mut tensors, counts)
+            let State { field, dataset, .. } = &trainer.state;
+            let (instances, times) = (field.instances.len(), dataset.times.len());
+            trainer.state.objects = KnownObjects::restored(objects, &mut tensors, instances, times)
                 .ok_or_else(|| unusable("the fitted objects do not fit the capture"))?;
         }
         if ![0, trainer.state.field.instances.len() + 1].contains(&state.travelling.len()) {

@@ -68,35 +68,47 @@ struct Moments {
     point: Adam,
 }
 
+/// An object whose poses are known.
+#[derive(Clone, Copy)]
+pub(super) struct PosedObject<'a> {
+    pub(super) views: &'a [ObjectView],
+    /// World from object, by time.
+    pub(super) base: &'a BTreeMap<usize, Pose>,
+    /// The larger of half height and radius, metres.
+    pub(super) size: f64,
+    /// Direction away from the support, in the frame of the object, where there is one: the axis keeps its angle to it,
+    /// for furniture has upright and level hinges.
+    pub(super) up: Option<DVec3>,
+}
+
+/// A part of a body.
+pub(super) struct Part {
+    /// Joint that it is on.
+    pub(super) hinge: Hinge,
+    /// By Gaussian of the body, true for those of the part.
+    pub(super) members: Vec<bool>,
+    /// Values of the joint by time, radians or metres.
+    pub(super) values: BTreeMap<usize, f64>,
+}
+
 /// A base and, behind its Gaussians, those of a part on a joint; without a joint all of them are the base.
 pub(super) struct Body<'a> {
-    views: &'a [ObjectView],
-    /// World from object, by time.
-    base: &'a BTreeMap<usize, Pose>,
+    object: PosedObject<'a>,
     pub(super) shape: Shape,
     pub(super) hinge: Option<Hinge>,
     /// Of the joint, by time.
     pub(super) values: BTreeMap<usize, f64>,
-    size: f64,
-    /// Direction away from the support: the axis keeps its angle to it, for furniture has upright and level hinges.
-    up: Option<DVec3>,
     moments: Moments,
     rng: Pcg64,
 }
 
 impl<'a> Body<'a> {
-    /// A body whose Gaussians from `first` on are the part.
-    pub(super) fn new(
-        (views, base): (&'a [ObjectView], &'a BTreeMap<usize, Pose>),
-        shape: Shape,
-        part: Option<(Hinge, Vec<bool>, BTreeMap<usize, f64>)>,
-        (size, up): (f64, Option<DVec3>),
-        rng: Pcg64,
-    ) -> Self {
+    /// A body of the Gaussians of a shape.
+    pub(super) fn new(object: PosedObject<'a>, shape: Shape, part: Option<Part>, rng: Pcg64) -> Self {
         let (mut hinge, mut values) = (None, BTreeMap::new());
         let shape = match part {
             None => shape,
-            Some((of, members, at)) => {
+            Some(Part { hinge: of, members, values: at }) => {
                 let still = |name| TrackGroup { deformed: false, ..TrackGroup::still(name, of.point) };
                 let pose = TrackPose { time: 0.0, translation: of.point, rotation: DQuat::IDENTITY };
                 let groups = vec![still("base"), TrackGroup { poses: vec![pose], ..still("part") }];
@@ -105,7 +117,7 @@ impl<'a> Body<'a> {
             }
         };
         let moments = Moments { values: BTreeMap::new(), axis: Adam::new(3), point: Adam::new(3) };
-        Self { views, base, shape, hinge, values, size, up, moments, rng }
+        Self { object, shape, hinge, values, moments, rng }
     }
 
     /// True for Gaussians of the part.
@@ -127,8 +139,8 @@ impl<'a> Body<'a> {
 
     /// Loss of a view with the joint at a value, by a shape of one's own.
     pub(super) fn loss_with(&self, shape: &mut Shape, view: usize, level: usize, value: f64) -> f64 {
-        let view = &self.views[view];
-        let Some(pose) = self.base.get(&view.time_index) else { return 0.0 };
+        let view = &self.object.views[view];
+        let Some(pose) = self.object.base.get(&view.time_index) else { return 0.0 };
         if let Some(hinge) = self.hinge {
             let (turn, place) = hinge.pose(value);
             shape.set_part(1, hinge.point, turn, place);
@@ -141,7 +153,7 @@ impl<'a> Body<'a> {
         let mut shape = self.shape.copied();
         let (mut sum, mut weights) = (0.0, 0.0);
         for view in views {
-            let of = &self.views[*view];
+            let of = &self.object.views[*view];
             sum += of.visible * self.loss_with(&mut shape, *view, level, self.value_at(of.time_index));
             weights += of.visible;
         }
@@ -171,9 +183,9 @@ impl<'a> Body<'a> {
     }
 
     fn step(&mut self, view: usize, level: usize, rate: f64, of_joint: f64) {
-        let view = &self.views[view];
+        let view = &self.object.views[view];
         let time = view.time_index;
-        let Some(pose) = self.base.get(&time) else { return };
+        let Some(pose) = self.object.base.get(&time) else { return };
         let value = self.value_at(time);
         if let Some(hinge) = self.hinge {
             let (turn, place) = hinge.pose(value);
@@ -208,18 +220,18 @@ impl<'a> Body<'a> {
             }
         };
         let (mut axis, mut point, mut at) = (hinge.axis, hinge.point, value);
-        let unit = hinge.unit(self.size);
+        let unit = hinge.unit(self.object.size);
         let moments = self.moments.values.entry(time).or_insert_with(|| Adam::new(1));
         moments.step(std::iter::once(of_value), RATES[0] * unit * rate, |_, step| at -= step);
         let values = |v: DVec3| v.to_array().into_iter();
         self.moments.axis.step(values(of_axis), RATES[1] * rate, |k, step| axis[k] -= step);
         if hinge.kind == JointKind::Revolute {
-            let rate = RATES[2] * self.size * rate;
+            let rate = RATES[2] * self.object.size * rate;
             self.moments.point.step(values(of_point), rate, |k, step| point[k] -= step);
             // Along the axis it says nothing.
             point -= hinge.axis * hinge.axis.dot(point - hinge.point);
         }
-        if let Some(up) = self.up {
+        if let Some(up) = self.object.up {
             let along = hinge.axis.dot(up);
             axis += up * (along - axis.dot(up));
             if along.abs() > UPRIGHT {

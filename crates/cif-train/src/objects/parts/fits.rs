@@ -8,14 +8,24 @@ use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 use super::super::shape::{Pose, Shape};
-use super::body::{Body, Hinge, between, range};
-use super::guesses::Guess;
+use super::body::{Body, Hinge, Part, between, range};
+use super::guesses::{Guess, JointValues};
 use super::promise::LOOKS;
 use super::scope::Search;
 use super::search::search;
 
-/// Gaussians of base and part, and steps, of fine fits.
-pub(super) const FINELY: ([usize; 2], usize) = ([500, 250], 500);
+/// Effort that a fit of base and part takes.
+#[derive(Clone, Copy)]
+pub(super) struct Effort {
+    /// Gaussians of the base.
+    pub(super) base: usize,
+    /// Gaussians of the part.
+    pub(super) part: usize,
+    pub(super) steps: usize,
+}
+
+/// Effort of fine fits.
+pub(super) const FINELY: Effort = Effort { base: 500, part: 250, steps: 500 };
 
 /// Places of a hinge that are tried about that of a fit: steps to each side of it, and a step, of the size.
 const PLACES: i32 = 3;
@@ -50,19 +60,24 @@ impl<'a> Search<'a> {
         &self,
         guess: Guess,
         values: &BTreeMap<usize, f64>,
-        ([of_base, of_part], steps): ([usize; 2], usize),
+        effort: Effort,
         level: usize,
     ) -> Option<Fit<'a>> {
         let hinge = guess.hinge;
-        let mut base = self.hull(self.base, None, of_base)?;
+        let mut base = self.hull(self.base, None, effort.base)?;
         base.fade(FAINT, |place| guess.has(place, 0.0));
         let margin = 0.1 * self.size;
         let inside = |place: DVec3| guess.has(place, margin);
-        let mut part = self.hull(&self.posed(hinge, values), Some(&inside), of_part)?;
+        let mut part = self.hull(&self.posed(hinge, values), Some(&inside), effort.part)?;
         part.fade(FAINT, |place| !guess.has(place, 0.0));
-        let mut body = self.together((base, &part), hinge, values);
-        body.steps(&self.train, steps, level, |share| if share < 0.2 { (1.0, 0.0) } else { (1.0, 1.0) });
-        let loss = body.mean_loss(&self.train, level);
+        let mut body = self.together(base, &part, hinge, values);
+        body.steps(
+            &self.views.train,
+            effort.steps,
+            level,
+            |share| if share < 0.2 { (1.0, 0.0) } else { (1.0, 1.0) },
+        );
+        let loss = body.mean_loss(&self.views.train, level);
         Some(Fit { guess, body, loss })
     }
 
@@ -75,7 +90,8 @@ impl<'a> Search<'a> {
     /// A base and a part on a joint.
     pub(super) fn together(
         &self,
-        (base, part): (Shape, &Shape),
+        base: Shape,
+        part: &Shape,
         hinge: Hinge,
         values: &BTreeMap<usize, f64>,
     ) -> Body<'a> {
@@ -83,7 +99,7 @@ impl<'a> Search<'a> {
         let members = (0..of_base + part.gaussians().len()).map(|row| row >= of_base).collect();
         let times = self.times(usize::MAX);
         let values = times.keys().map(|time| (*time, between(values, *time))).collect();
-        self.body(base.joined(part), Some((hinge, members, values)))
+        self.body(base.joined(part), Some(Part { hinge, members, values }))
     }
 
     /// The joint of a body and its values, a hinge where it explains most: it was guessed at a side of the hull, which
@@ -95,7 +111,7 @@ impl<'a> Search<'a> {
         level: usize,
     ) -> (Hinge, BTreeMap<usize, f64>) {
         let hinge = body.hinge.unwrap_or(guess.hinge);
-        if guess.is_round || hinge.kind == JointKind::Prismatic {
+        if guess.values.is_round || hinge.kind == JointKind::Prismatic {
             return (hinge, body.values);
         }
         let times = self.times(LOOKS);
@@ -105,7 +121,7 @@ impl<'a> Search<'a> {
             let aside = PLACE * self.size * (f64::from(i) * first + f64::from(j) * second);
             let moved = Hinge { point: hinge.point + aside, ..hinge };
             body.hinge = Some(moved);
-            let (values, loss) = search(&body, &times, (&guess.values, false), level);
+            let (values, loss) = search(&body, &times, &guess.values, level);
             if loss < best.2 {
                 best = (moved, values, loss);
             }
@@ -124,7 +140,8 @@ impl<'a> Search<'a> {
         let finer: Vec<f64> = (0..count)
             .map(|k| low - widened + (high - low + 2.0 * widened) * f64::from(k) / f64::from(count - 1))
             .collect();
-        let again = if guess.is_round { (&guess.values[..], true) } else { (&finer[..], false) };
+        let finer = JointValues::open(finer);
+        let again = if guess.values.is_round { &guess.values } else { &finer };
         let (found, _) = search(&body, &all, again, level);
         // The search is coarse: what is as good stays.
         let mut shape = body.shape.copied();
@@ -137,18 +154,18 @@ impl<'a> Search<'a> {
                 body.values.insert(time, value);
             }
         }
-        body.steps(&self.train, steps, level, |share| {
+        body.steps(&self.views.train, steps, level, |share| {
             let rate = if share < 0.5 { 1.0 } else { 0.3 };
             (rate, rate)
         });
-        let loss = body.mean_loss(&self.train, level);
+        let loss = body.mean_loss(&self.views.train, level);
         Fit { guess, body, loss }
     }
 
     /// The body that is kept, fitted to all views that show it well: at the value 0 as it is seen first.
     pub(super) fn finished(&self, mut body: Body<'a>, errors: [f64; 2]) -> Option<Jointed> {
-        let all: Vec<usize> = self.train.iter().chain(&self.left_out).copied().collect();
-        body.steps(&all, FINELY.1, 0, |share| (0.6 * 0.1_f64.powf(share), 0.5 * 0.1_f64.powf(share)));
+        let all: Vec<usize> = self.views.train.iter().chain(&self.views.left_out).copied().collect();
+        body.steps(&all, FINELY.steps, 0, |share| (0.6 * 0.1_f64.powf(share), 0.5 * 0.1_f64.powf(share)));
         self.jointed(&body, errors)
     }
 

@@ -36,10 +36,24 @@ pub(super) struct Guess {
     pub(super) hinge: Hinge,
     /// The part is what is beyond this plane: its normal, and its offset.
     pub(super) cut: (DVec3, f64),
-    /// Values that are tried at each time, ascending and equally far apart.
+    /// Values that are tried at each time.
+    pub(super) values: JointValues,
+}
+
+/// Values of a joint that are tried.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct JointValues {
+    /// Ascending and equally far apart; radians or metres.
     pub(super) values: Vec<f64>,
     /// True where the last value is followed by the first.
     pub(super) is_round: bool,
+}
+
+impl JointValues {
+    /// Values of which the last is not followed by the first.
+    pub(super) fn open(values: Vec<f64>) -> Self {
+        Self { values, is_round: false }
+    }
 }
 
 impl Guess {
@@ -133,25 +147,25 @@ pub(super) fn guesses(sides: &Sides, stands: Option<&Plane>) -> Vec<Guess> {
                 at[face] = sign * cut(share).1;
                 at[side] = if towards > 0.0 { sides.high[side] } else { sides.low[side] };
                 let hinge = revolute(normal.cross(towards * sides.axes[side]), sides.point(at));
-                let values = degrees(-30.0, 150.0, 13);
-                all.push(Guess { hinge, cut: cut(share), values, is_round: false });
+                let values = JointValues::open(degrees(-30.0, 150.0, 13));
+                all.push(Guess { hinge, cut: cut(share), values });
             }
         }
         for share in DRAWERS {
             let hinge = slide(normal, sides.point(sides.middle()));
-            let values = spaced(-0.2 * extent, extent, 13);
-            all.push(Guess { hinge, cut: cut(share), values, is_round: false });
+            let values = JointValues::open(spaced(-0.2 * extent, extent, 13));
+            all.push(Guess { hinge, cut: cut(share), values });
         }
         for (share, side) in PLATES.iter().flat_map(|share| others.iter().map(move |side| (*share, *side))) {
             let reach = sides.extent(side);
             let hinge = slide(sides.axes[side], sides.point(sides.middle()));
-            let values = spaced(-0.9 * reach, 0.9 * reach, 13);
-            all.push(Guess { hinge, cut: cut(share), values, is_round: false });
+            let values = JointValues::open(spaced(-0.9 * reach, 0.9 * reach, 13));
+            all.push(Guess { hinge, cut: cut(share), values });
         }
         for share in WHEELS {
             let hinge = revolute(normal, sides.point(sides.middle()));
-            let values = degrees(-180.0, 150.0, 12);
-            all.push(Guess { hinge, cut: cut(share), values, is_round: true });
+            let values = JointValues { values: degrees(-180.0, 150.0, 12), is_round: true };
+            all.push(Guess { hinge, cut: cut(share), values });
         }
         if sign > 0.0 {
             for (share, axis) in CUTS.iter().flat_map(|share| others.iter().map(move |axis| (*share, *axis)))
@@ -159,8 +173,8 @@ pub(super) fn guesses(sides: &Sides, stands: Option<&Plane>) -> Vec<Guess> {
                 let mut at = sides.middle();
                 at[face] = sides.low[face] + share * extent;
                 let hinge = revolute(sides.axes[axis], sides.point(at));
-                let values = degrees(-120.0, 120.0, 13);
-                all.push(Guess { hinge, cut: (normal, at[face]), values, is_round: false });
+                let values = JointValues::open(degrees(-120.0, 120.0, 13));
+                all.push(Guess { hinge, cut: (normal, at[face]), values });
             }
         }
     }

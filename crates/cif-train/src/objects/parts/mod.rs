@@ -33,7 +33,7 @@ use rayon::prelude::*;
 
 use self::body::Hinge;
 pub(crate) use self::fits::Jointed;
-use self::fits::{FINELY, Fit, keep_kinds};
+use self::fits::{Effort, FINELY, Fit, keep_kinds};
 use self::guesses::Guess;
 use self::scope::Search;
 use super::discs;
@@ -41,18 +41,19 @@ use super::meeting::meeting_point;
 use super::object::Object;
 use super::rotation::{Turning, turning};
 use super::shape::Pose;
-use super::trials::split;
+use super::split::{SplitViews, times_of};
 use crate::error::TrainError;
 
 /// Reliable times below which parts cannot be told apart.
 const FEWEST_TIMES: usize = 8;
 
 /// Gaussians and steps of the static body that guesses are cut from.
-const ROUGH: (usize, usize) = (300, 300);
+const GAUSSIANS: usize = 300;
+const STEPS: usize = 300;
 
-/// Guesses that are fitted, with Gaussians of base and part and steps between searches.
+/// Guesses that are fitted, and the effort that this takes between searches.
 const FITTED: usize = 12;
-const FIT: ([usize; 2], usize) = ([200, 150], 250);
+const FIT: Effort = Effort { base: 200, part: 150, steps: 250 };
 
 /// Of these, those whose values are searched for again, and those that are fitted finely.
 const AGAIN: usize = 8;
@@ -91,17 +92,17 @@ pub(super) fn turning_ball(object: Object<'_>) -> Result<Option<Jointed>, TrainE
     let rests = Pose { rotation: DQuat::IDENTITY, translation: ball.centre };
     let base: BTreeMap<usize, Pose> = object.views.iter().map(|view| (view.time_index, rests)).collect();
     let is_shown = |view: &usize| !object.views[*view].is_sliver();
-    let search = Search::new(object, &base, ((0..object.views.len()).filter(is_shown).collect(), Vec::new()));
+    let views = (0..object.views.len()).filter(is_shown).collect();
+    let search = Search::new(object, &base, SplitViews::whole(views));
     let hinge = Hinge { kind: JointKind::Revolute, axis, point: DVec3::ZERO };
     let is_ball = |place: DVec3| place.length() < ball.radius;
     let is_stand = |place: DVec3| !is_ball(place) && search.is_within(place);
-    let ([of_base, of_part], steps) = FINELY;
-    let stand = search.hull(&base, Some(&is_stand), of_base);
-    let turned = search.hull(&search.posed(hinge, &angles), Some(&is_ball), of_part);
+    let stand = search.hull(&base, Some(&is_stand), FINELY.base);
+    let turned = search.hull(&search.posed(hinge, &angles), Some(&is_ball), FINELY.part);
     let Some((stand, turned)) = stand.zip(turned) else { return Ok(None) };
-    let mut body = search.together((stand, &turned), hinge, &angles);
+    let mut body = search.together(stand, &turned, hinge, &angles);
     // Light, which stays where it is, would pull the joint back.
-    body.steps(&search.train, 2 * steps, 0, |share| (0.1_f64.powf(share), 0.0));
+    body.steps(&search.views.train, 2 * FINELY.steps, 0, |share| (0.1_f64.powf(share), 0.0));
     phases.check()?;
     let Some(mut found) = search.jointed(&body, errors) else { return Ok(None) };
     // Of the stand what got into the ball showed its light.
@@ -134,17 +135,15 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
     let phases = object.surroundings.phases;
     let is_usable = |view: &usize| views[*view].is_reliable() && base.contains_key(&views[*view].time_index);
     let reliable: Vec<usize> = (0..views.len()).filter(is_usable).collect();
-    let mut times: Vec<usize> = reliable.iter().map(|view| views[*view].time_index).collect();
-    times.dedup();
-    if times.len() < FEWEST_TIMES {
+    if times_of(views, &reliable).len() < FEWEST_TIMES {
         return Ok(None);
     }
-    let search = Search::new(object, base, split(views, &reliable, &times));
-    let level = search.level();
-    let Some(rough) = search.rigid(&search.train, ROUGH, level) else { return Ok(None) };
-    let uncut = rough.mean_loss(&search.train, level);
+    let search = Search::new(object, base, SplitViews::of(views, &reliable));
+    let (train, level) = (&search.views.train, search.level());
+    let Some(rough) = search.rigid(train, GAUSSIANS, STEPS, level) else { return Ok(None) };
+    let uncut = rough.mean_loss(train, level);
     phases.check()?;
-    let Some((closed, still)) = search.closed(ROUGH, level) else { return Ok(None) };
+    let Some((closed, still)) = search.closed(GAUSSIANS, STEPS, level) else { return Ok(None) };
     if uncut <= ALIKE * closed.mean_loss(&still, level) {
         return Ok(None);
     }
@@ -156,7 +155,7 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
     let mut begun: Vec<Fit<'_>> = tried
         .into_par_iter()
         .take(FITTED)
-        .filter_map(|(guess, values, _)| search.begun(guess, &values, FIT, level))
+        .filter_map(|tried| search.begun(tried.guess, &tried.values, FIT, level))
         .collect();
     keep_kinds(&mut begun, AGAIN);
     phases.check()?;
@@ -165,29 +164,26 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
         return Ok(None);
     }
     let mut fitted: Vec<Fit<'_>> =
-        begun.into_par_iter().map(|begun| search.finely_valued(begun, FIT.1, level)).collect();
+        begun.into_par_iter().map(|begun| search.finely_valued(begun, FIT.steps, level)).collect();
     keep_kinds(&mut fitted, FINE);
     phases.check()?;
     if !promises(&fitted, PROMISES[1]) {
         return Ok(None);
     }
     let (rigid, mut fine) = rayon::join(
-        || {
-            let ([base, part], steps) = FINELY;
-            search.rigid(&search.train, (base + part, 2 * steps), 0)
-        },
+        || search.rigid(train, FINELY.base + FINELY.part, 2 * FINELY.steps, 0),
         || {
             let finely = |Fit { guess, body, .. }: Fit<'_>| {
                 let (hinge, values) = search.placed(&guess, body, level);
                 let begun = search.begun(Guess { hinge, ..guess }, &values, FINELY, 0)?;
-                Some(search.finely_valued(begun, FINELY.1, 0))
+                Some(search.finely_valued(begun, FINELY.steps, 0))
             };
             fitted.into_par_iter().filter_map(finely).collect::<Vec<_>>()
         },
     );
     phases.check()?;
     let Some(rigid) = rigid else { return Ok(None) };
-    let judged = if search.left_out.is_empty() { &search.train } else { &search.left_out };
+    let judged = search.views.judged();
     let still = rigid.mean_loss(judged, 0);
     for fit in &mut fine {
         fit.loss = fit.body.mean_loss(judged, 0);

@@ -7,8 +7,8 @@ use rand::RngExt;
 use rayon::prelude::*;
 
 use super::super::view::Seen;
-use super::body::Body;
-use super::guesses::{Guess, Sides, guesses};
+use super::body::{Body, Part};
+use super::guesses::{Guess, JointValues, Sides, guesses};
 use super::scope::Search;
 use super::search::search;
 
@@ -33,14 +33,19 @@ const PART: [f64; 2] = [0.03, 0.7];
 /// Loss of the best guess, of that of the static body, from which nothing is looked for.
 const PROMISE: f64 = 0.99;
 
+/// A guess whose values were searched for.
+pub(super) struct TriedGuess {
+    pub(super) guess: Guess,
+    /// Value by time, radians or metres.
+    pub(super) values: BTreeMap<usize, f64>,
+    /// Mean loss per view.
+    loss: f64,
+}
+
 impl<'a> Search<'a> {
     /// Guesses about static Gaussians with their values, best first; none where none promises anything. The views are those
     /// that the Gaussians were made from.
-    pub(super) fn tried(
-        &self,
-        closed: &Body<'a>,
-        still: &[usize],
-    ) -> Vec<(Guess, BTreeMap<usize, f64>, f64)> {
+    pub(super) fn tried(&self, closed: &Body<'a>, still: &[usize]) -> Vec<TriedGuess> {
         let means = &closed.shape.gaussians().means;
         let places: Vec<DVec3> = means.iter().map(|mean| DVec3::from_array(mean.map(f64::from))).collect();
         let carved = self.carved(still);
@@ -55,15 +60,16 @@ impl<'a> Search<'a> {
             if !(PART[0]..=PART[1]).contains(&share) {
                 return None;
             }
-            let body = self.body(closed.shape.copied(), Some((guess.hinge, members, BTreeMap::new())));
-            let (values, loss) = search(&body, &times, (&guess.values, guess.is_round), level);
-            Some((guess, values, loss))
+            let part = Part { hinge: guess.hinge, members, values: BTreeMap::new() };
+            let body = self.body(closed.shape.copied(), Some(part));
+            let (values, loss) = search(&body, &times, &guess.values, level);
+            Some(TriedGuess { guess, values, loss })
         };
         let try_all =
             |sides: &Sides| -> Vec<_> { guesses(sides, plane).into_par_iter().filter_map(try_one).collect() };
         let mut tried = try_all(&sides);
-        let (_, uncut) = search(closed, &times, (&[0.0], false), level);
-        let best = tried.iter().map(|(.., loss)| *loss).fold(f64::INFINITY, f64::min);
+        let (_, uncut) = search(closed, &times, &JointValues::open(vec![0.0]), level);
+        let best = tried.iter().map(|tried| tried.loss).fold(f64::INFINITY, f64::min);
         if best > PROMISE * uncut {
             return Vec::new();
         }
@@ -73,12 +79,13 @@ impl<'a> Search<'a> {
                 tried.extend(try_all(&sides.turned(degrees.to_radians(), inside)));
             }
         }
-        tried.sort_by(|a, b| a.2.total_cmp(&b.2));
+        tried.sort_by(|a, b| a.loss.total_cmp(&b.loss));
         // Of joints about one axis the best.
-        let mut distinct: Vec<(Guess, BTreeMap<usize, f64>, f64)> = Vec::new();
-        for (guess, values, loss) in tried {
-            if !distinct.iter().any(|(other, ..)| guess.hinge.is_like(&other.hinge, ALIKE * self.size)) {
-                distinct.push((guess, values, loss));
+        let mut distinct: Vec<TriedGuess> = Vec::new();
+        for found in tried {
+            let hinge = found.guess.hinge;
+            if !distinct.iter().any(|other| hinge.is_like(&other.guess.hinge, ALIKE * self.size)) {
+                distinct.push(found);
             }
         }
         distinct

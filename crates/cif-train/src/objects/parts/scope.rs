@@ -5,11 +5,11 @@ use std::collections::BTreeMap;
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
-use super::super::fit::hull;
-use super::super::object::{Object, Surroundings};
+use super::super::object::Object;
 use super::super::shape::{Pose, Shape};
+use super::super::split::{SplitViews, times_of};
 use super::super::view::{is_one_camera, median};
-use super::body::{Body, Hinge};
+use super::body::{Body, Part, PosedObject};
 
 /// Most views of a time that values are searched on.
 const VIEWS: usize = 2;
@@ -28,8 +28,7 @@ pub(super) struct Search<'a> {
     pub(super) object: Object<'a>,
     /// World from object, by time.
     pub(super) base: &'a BTreeMap<usize, Pose>,
-    pub(super) train: Vec<usize>,
-    pub(super) left_out: Vec<usize>,
+    pub(super) views: SplitViews,
     pub(super) size: f64,
     /// Direction away from the support, in the frame of the object, where there is one.
     pub(super) up: Option<DVec3>,
@@ -38,57 +37,53 @@ pub(super) struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
-    /// A search of an object whose poses are known, on views to fit to and views left out.
-    pub(super) fn new(
-        object: Object<'a>,
-        base: &'a BTreeMap<usize, Pose>,
-        (train, left_out): (Vec<usize>, Vec<usize>),
-    ) -> Self {
+    /// A search of an object whose poses are known.
+    pub(super) fn new(object: Object<'a>, base: &'a BTreeMap<usize, Pose>, views: SplitViews) -> Self {
         let rotation = base.values().next().map_or(DQuat::IDENTITY, |pose| pose.rotation);
         let up = object.surroundings.plane.map(|plane| rotation.inverse() * plane.normal);
         let size = object.outline.size();
-        let one_camera = is_one_camera(train.iter().chain(&left_out).map(|view| &object.views[*view]));
-        Self { object, base, train, left_out, size, up, one_camera }
+        let one_camera =
+            is_one_camera(views.train.iter().chain(&views.left_out).map(|view| &object.views[*view]));
+        Self { object, base, views, size, up, one_camera }
     }
 
     /// Reduction at which guesses are compared.
     pub(super) fn level(&self) -> usize {
-        let mut areas: Vec<f64> = self.train.iter().map(|view| self.object.views[*view].detail()).collect();
+        let mut areas: Vec<f64> =
+            self.views.train.iter().map(|view| self.object.views[*view].detail()).collect();
         usize::from(median(&mut areas) > 1500.0)
     }
 
+    /// Gaussians inside the masks in poses, within a bound in the frame of the object.
     pub(super) fn hull(
         &self,
         poses: &BTreeMap<usize, Pose>,
         bound: Option<&dyn Fn(DVec3) -> bool>,
         count: usize,
     ) -> Option<Shape> {
-        let Surroundings { near, phases, .. } = self.object.surroundings;
         let reach = 1.3 * self.size;
         // A part leaves the room of the base.
         let bounded = bound.is_none();
         let inside =
             |place: DVec3| (!bounded || self.is_within(place)) && bound.is_none_or(|bound| bound(place));
-        let bound: Option<&dyn Fn(DVec3) -> bool> = Some(&inside);
         let mut rng = self.object.rng();
-        let mut shape = hull(self.object.views, poses, (reach, bound), count, (near, phases), &mut rng)?;
+        let mut shape = self.object.hull_within(poses, reach, Some(&inside), count, &mut rng)?;
         shape.fade(0.0, |_| true);
         Some(shape)
     }
 
-    pub(super) fn body(
-        &self,
-        shape: Shape,
-        part: Option<(Hinge, Vec<bool>, BTreeMap<usize, f64>)>,
-    ) -> Body<'a> {
-        Body::new((self.object.views, self.base), shape, part, (self.size, self.up), self.object.rng())
+    /// The Gaussians of a shape as the object, with a part where it has one.
+    pub(super) fn body(&self, shape: Shape, part: Option<Part>) -> Body<'a> {
+        let Search { object, base, size, up, .. } = *self;
+        Body::new(PosedObject { views: object.views, base, size, up }, shape, part, object.rng())
     }
 
     /// The object without parts, as some views show it: with a number of Gaussians, after some steps.
     pub(super) fn rigid(
         &self,
         views: &[usize],
-        (gaussians, steps): (usize, usize),
+        gaussians: usize,
+        steps: usize,
         level: usize,
     ) -> Option<Body<'a>> {
         let times = views.iter().map(|view| self.object.views[*view].time_index);
@@ -99,29 +94,33 @@ impl<'a> Search<'a> {
     }
 
     /// The object without parts as it looks in the row of times that are most alike, with the views of these.
-    pub(super) fn closed(&self, sizes: (usize, usize), level: usize) -> Option<(Body<'a>, Vec<usize>)> {
+    pub(super) fn closed(
+        &self,
+        gaussians: usize,
+        steps: usize,
+        level: usize,
+    ) -> Option<(Body<'a>, Vec<usize>)> {
         let time_of = |view: usize| self.object.views[view].time_index;
-        let mut times: Vec<usize> = self.train.iter().map(|view| time_of(*view)).collect();
-        times.dedup();
+        let times = times_of(self.object.views, &self.views.train);
         let length = (times.len() / ROW).max(FEWEST_IN_ROW).min(times.len());
         let of_row = |row: usize| {
             let first = row * (times.len() - length) / (ROWS - 1);
             let range = times[first]..=times[first + length - 1];
             let views: Vec<usize> =
-                self.train.iter().copied().filter(|view| range.contains(&time_of(*view))).collect();
-            let body = self.rigid(&views, sizes, level)?;
+                self.views.train.iter().copied().filter(|view| range.contains(&time_of(*view))).collect();
+            let body = self.rigid(&views, gaussians, steps, level)?;
             Some((body.mean_loss(&views, level), body, views))
         };
         let rows: Vec<_> = (0..ROWS).into_par_iter().filter_map(of_row).collect();
         let (_, mut body, views) = rows.into_iter().min_by(|a, b| a.0.total_cmp(&b.0))?;
-        body.steps(&views, sizes.1, level, |_| (0.5, 0.0));
+        body.steps(&views, steps, level, |_| (0.5, 0.0));
         Some((body, views))
     }
 
     /// Views of some times, one each, or of all times, a few each.
     pub(super) fn times(&self, count: usize) -> BTreeMap<usize, Vec<usize>> {
         let mut of: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
-        for view in &self.train {
+        for view in &self.views.train {
             of.entry(self.object.views[*view].time_index).or_default().push(*view);
         }
         let all = of.len();

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 
 use super::super::sequence::{least, unwind};
 use super::body::Body;
+use super::guesses::JointValues;
 
 /// Loss per step between values of neighbouring times, of the mean loss of a time.
 const MOVING: f64 = 0.005;
@@ -13,9 +14,10 @@ const MOVING: f64 = 0.005;
 pub(super) fn search(
     body: &Body<'_>,
     times: &BTreeMap<usize, Vec<usize>>,
-    (values, is_round): (&[f64], bool),
+    tried: &JointValues,
     level: usize,
 ) -> (BTreeMap<usize, f64>, f64) {
+    let JointValues { values, is_round } = tried;
     let mut shape = body.shape.copied();
     let count = values.len();
     let mut table: Vec<Vec<f64>> = Vec::with_capacity(times.len());
@@ -30,13 +32,13 @@ pub(super) fn search(
     let typical = table.iter().map(smallest).sum::<f64>() / table.len().max(1) as f64;
     let apart = |a: usize, b: usize| {
         let steps = a.abs_diff(b);
-        if is_round { steps.min(count - steps) } else { steps }
+        if *is_round { steps.min(count - steps) } else { steps }
     };
     let (places, sum) = least(&table, |_, from, to| MOVING * typical * apart(from, to) as f64);
     let total = sum / table.len().max(1) as f64;
     let mut found: BTreeMap<usize, f64> =
         times.keys().copied().zip(places.iter().map(|place| values[*place])).collect();
-    if is_round {
+    if *is_round {
         unwind(found.values_mut());
     }
     (found, total)

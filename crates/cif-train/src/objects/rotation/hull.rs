@@ -135,7 +135,7 @@ pub(super) fn voxel(evidence: &Evidence<'_>, size: f64, course: &Course) -> Opti
 
 impl Hull {
     /// The hull of an object of this size, in voxels of this edge, on a course.
-    pub(super) fn of(evidence: &Evidence<'_>, (size, voxel): (f64, f64), course: &Course) -> Self {
+    pub(super) fn of(evidence: &Evidence<'_>, size: f64, voxel: f64, course: &Course) -> Self {
         let views: Vec<&ObjectView> = evidence.looks.iter().map(|look| look.view).collect();
         let reach = DVec3::splat(REACH * size);
         let rough = Grid::over(-reach, reach, ROUGH * size);

@@ -61,7 +61,8 @@ pub(in super::super) enum Shown {
 /// where it is that of poses: these, or others within 30 degrees of them, beat all rivals and the course without turns
 /// that differ by more.
 pub(in super::super) fn shown(
-    (views, size): (&[ObjectView], f64),
+    views: &[ObjectView],
+    size: f64,
     poses: &Course,
     unturned: Course,
     rivals: impl IntoIterator<Item = Course>,
@@ -87,7 +88,7 @@ pub(super) struct Judge<'a> {
     /// Size of the object and edge of a voxel, metres.
     size: f64,
     voxel: f64,
-    /// Cells of the layer of light by pixel, and their number.
+    /// Cells of the layer of light.
     light: LayerCells,
     courses: Vec<Course>,
     residuals: Vec<Residuals>,
@@ -103,13 +104,13 @@ impl<'a> Judge<'a> {
             evidence,
             size,
             voxel,
-            light: (Vec::new(), 0),
+            light: LayerCells { of_pixel: Vec::new(), count: 0 },
             courses: Vec::new(),
             residuals: Vec::new(),
         };
         let (hull, hits) = judge.seen(&unturned);
         judge.light = light_cells(&judge.evidence, &hull, &hits);
-        judge.residuals.push(judge.residuals_of(&unturned, (&hull, &hits), false));
+        judge.residuals.push(judge.residuals_of(&unturned, &hull, &hits, false));
         judge.courses.push(unturned);
         Some(judge)
     }
@@ -118,7 +119,7 @@ impl<'a> Judge<'a> {
     pub(super) fn add(&mut self, courses: Vec<Course>) {
         let of = |course: &Course| {
             let (hull, hits) = self.seen(course);
-            self.residuals_of(course, (&hull, &hits), true)
+            self.residuals_of(course, &hull, &hits, true)
         };
         let found: Vec<Residuals> = courses.par_iter().map(of).collect();
         self.residuals.extend(found);
@@ -161,16 +162,17 @@ impl<'a> Judge<'a> {
 
     /// Hull of a hypothesis, and what pixels see of it.
     fn seen(&self, course: &Course) -> (Hull, Vec<Option<Hit>>) {
-        let hull = Hull::of(&self.evidence, (self.size, self.voxel), course);
+        let hull = Hull::of(&self.evidence, self.size, self.voxel, course);
         let hits = hits(&self.evidence, &hull, course);
         (hull, hits)
     }
 
-    fn residuals_of(&self, course: &Course, (hull, hits): (&Hull, &[Option<Hit>]), turns: bool) -> Residuals {
-        let paint = hits.iter().map(|hit| hit.map(|hit| hit.cell)).collect();
+    fn residuals_of(&self, course: &Course, hull: &Hull, hits: &[Option<Hit>], turns: bool) -> Residuals {
+        let of_pixel = hits.iter().map(|hit| hit.map(|hit| hit.cell)).collect();
+        let paint = LayerCells { of_pixel, count: hull.cells() };
         Residuals {
-            layered: layered(&self.evidence, &(paint, hull.cells()), &self.light, turns),
-            shaded: shaded(&self.evidence, (hits, hull.cells()), course),
+            layered: layered(&self.evidence, &paint, &self.light, turns),
+            shaded: shaded(&self.evidence, hits, hull.cells(), course),
             volume: hull.volume(),
         }
     }
@@ -196,11 +198,12 @@ fn hits(evidence: &Evidence<'_>, hull: &Hull, course: &Course) -> Vec<Option<Hit
 fn light_cells(evidence: &Evidence<'_>, hull: &Hull, hits: &[Option<Hit>]) -> LayerCells {
     let cameras = evidence.looks.iter().map(|look| look.camera).max().unwrap_or(0) + 1;
     if hits.iter().flatten().count() < FEWEST {
-        return (vec![Some(0); hits.len()], 1);
+        return LayerCells { of_pixel: vec![Some(0); hits.len()], count: 1 };
     }
     let of_pixel = evidence.looks.iter().flat_map(|look| look.pixels.iter().map(|_| look.camera));
     let cell = |(hit, camera): (&Option<Hit>, u32)| hit.map(|hit| hit.cell * cameras + camera);
-    (hits.iter().zip(of_pixel).map(cell).collect(), hull.cells() * cameras as usize)
+    let of_pixel = hits.iter().zip(of_pixel).map(cell).collect();
+    LayerCells { of_pixel, count: hull.cells() * cameras as usize }
 }
 
 /// The hypothesis that its nearest rival is farthest behind. A comparison that cannot be made counts as a draw, which

@@ -8,8 +8,13 @@ use super::folds::{FEWEST, FOLDS, OBSERVED, folds, numbered};
 /// Sweeps of back-fitting of the layers.
 const SWEEPS: usize = 5;
 
-/// Cells of a layer by pixel, and their number.
-pub(super) type LayerCells = (Vec<Option<u32>>, usize);
+/// Cells of a layer.
+pub(super) struct LayerCells {
+    /// Cell by pixel; `None` where it sees none.
+    pub(super) of_pixel: Vec<Option<u32>>,
+    /// Number of cells.
+    pub(super) count: usize,
+}
 
 /// A pixel that a model predicts.
 pub(super) struct Observation {
@@ -24,16 +29,16 @@ pub(super) struct Observation {
 /// Absolute residuals of the layered model on left-out pixels, each layer shrunk by one pseudo-observation per cell.
 pub(super) fn layered(
     evidence: &Evidence<'_>,
-    (paint, cells): &LayerCells,
-    (light, light_cells): &LayerCells,
+    paint: &LayerCells,
+    light: &LayerCells,
     turns: bool,
 ) -> Vec<f32> {
-    let mut found = vec![f32::NAN; paint.len()];
+    let mut found = vec![f32::NAN; paint.of_pixel.len()];
     let mut seen = Vec::new();
     let mut pixel = 0;
     for (look, shown) in evidence.looks.iter().enumerate() {
         for value in shown.pixels.iter().map(|pixel| pixel.value) {
-            if let (Some(paint), Some(light)) = (paint[pixel], light[pixel]) {
+            if let (Some(paint), Some(light)) = (paint.of_pixel[pixel], light.of_pixel[pixel]) {
                 let (paint, light) = (paint as usize, light as usize);
                 seen.push(Observation { pixel, look, paint, light, value });
             }
@@ -43,12 +48,14 @@ pub(super) fn layered(
     if seen.len() < FEWEST {
         return found;
     }
-    let cells = numbered(seen.iter_mut().map(|o| &mut o.paint), *cells);
-    let lights = numbered(seen.iter_mut().map(|o| &mut o.light), *light_cells);
+    let sizes = LayerSizes {
+        paint: numbered(seen.iter_mut().map(|o| &mut o.paint), paint.count),
+        light: numbered(seen.iter_mut().map(|o| &mut o.light), light.count),
+        views: evidence.looks.len(),
+    };
     let folds = folds(evidence);
-    let views = evidence.looks.len();
     for fold in 0..FOLDS {
-        let mut layers = Layers::start(&seen, (cells, lights, views), |o| folds[o.look] != fold);
+        let mut layers = Layers::start(&seen, &sizes, |o| folds[o.look] != fold);
         for _ in 0..SWEEPS {
             layers.sweep(&seen, turns);
         }
@@ -80,6 +87,16 @@ impl Means {
     }
 }
 
+/// Numbers of what the model has a mean of.
+pub(super) struct LayerSizes {
+    /// Cells of paint.
+    pub(super) paint: usize,
+    /// Cells of light.
+    pub(super) light: usize,
+    /// Views, each with a gain.
+    pub(super) views: usize,
+}
+
 /// The layers of the model, fitted to the observations outside a fold; gains of views to all.
 pub(super) struct Layers {
     gain: Means,
@@ -91,12 +108,12 @@ pub(super) struct Layers {
 impl Layers {
     pub(super) fn start(
         seen: &[Observation],
-        (cells, lights, views): (usize, usize, usize),
+        sizes: &LayerSizes,
         is_fitted: impl Fn(&Observation) -> bool,
     ) -> Self {
         let is_fitted: Vec<bool> = seen.iter().map(is_fitted).collect();
         let (mut gain, mut light, mut paint) =
-            (Means::zeros(views), Means::zeros(lights), Means::zeros(cells));
+            (Means::zeros(sizes.views), Means::zeros(sizes.light), Means::zeros(sizes.paint));
         for (o, is_fitted) in seen.iter().zip(&is_fitted) {
             gain.weights[o.look] += 1.0;
             gain.values[o.look] += o.value;

@@ -11,7 +11,7 @@ use super::super::sequence::{least, unwind};
 use super::compare::{gains, standard_errors};
 use super::evidence::{Evidence, Look, Pixel};
 use super::judge::{APART, GRAZING, SIGMAS};
-use super::layered::{Layers, Observation, layered};
+use super::layered::{LayerCells, LayerSizes, Layers, Observation, layered};
 
 /// Pixels of a view that are looked at.
 const PIXELS: usize = 400;
@@ -294,7 +294,9 @@ impl Seen {
             paint[spot.pixel] = Some(painted.cell(k, turned.angles[self.time_of[spot.look]]) as u32);
             light[spot.pixel] = Some(painted.light(k) as u32);
         }
-        layered(evidence, &(paint, painted.cells), &(light, painted.lights()), turns)
+        let paint = LayerCells { of_pixel: paint, count: painted.cells };
+        let light = LayerCells { of_pixel: light, count: painted.lights() };
+        layered(evidence, &paint, &light, turns)
     }
 
     /// The same turns in smaller steps.
@@ -485,8 +487,8 @@ impl Painted<'_> {
         let mut errors = vec![vec![0.0; turns]; seen.times.len()];
         let mut looks = vec![0.0; seen.times.len()];
         for left_out in 0..PARTS {
-            let sizes = (self.cells, self.lights(), seen.ranges.len());
-            let mut layers = Layers::start(&observations, sizes, |o| part(o.look) != left_out);
+            let sizes = LayerSizes { paint: self.cells, light: self.lights(), views: seen.ranges.len() };
+            let mut layers = Layers::start(&observations, &sizes, |o| part(o.look) != left_out);
             for _ in 0..SWEEPS {
                 layers.sweep(&observations, true);
             }

@@ -30,17 +30,18 @@ pub(in super::super) struct Revolving<'a> {
 }
 
 impl<'a> Revolving<'a> {
-    /// An object of this size (the larger of half height and radius, metres), by its views in the order of times; `None`
-    /// where they are too few.
+    /// An object of this size (the larger of half height and radius, metres), by its views in the order of times, with
+    /// the direction away from its support and the height of the course above it, metres; `None` where views are too few.
     pub(in super::super) fn new(
         views: impl Iterator<Item = &'a ObjectView>,
         size: f64,
         course: &'a Course,
-        (up, height): (DVec3, Option<f64>),
+        up: DVec3,
+        height: Option<f64>,
     ) -> Option<Self> {
         let evidence = Evidence::of(views)?;
         let voxel = voxel(&evidence, size, course)?;
-        let hull = Hull::of(&evidence, (size, voxel), course);
+        let hull = Hull::of(&evidence, size, voxel, course);
         Some(Self { evidence, size, voxel, course, hull, up, height })
     }
 
@@ -49,7 +50,7 @@ impl<'a> Revolving<'a> {
         let Some(solid) = self.solid(axis, None) else { return 0.0 };
         let pixels =
             self.evidence.looks.iter().flat_map(|look| look.pixels.iter().map(move |pixel| (look, pixel)));
-        let hit = pixels.filter(|(look, pixel)| solid.place(look, pixel, (&solid.hull, None)).is_some());
+        let hit = pixels.filter(|(look, pixel)| solid.place(look, pixel, &solid.hull, None).is_some());
         hit.count() as f64 / self.evidence.len().max(1) as f64
     }
 
@@ -116,9 +117,9 @@ impl Solid<'_, '_> {
     fn shown(&self, turning: Option<&Turning>) -> Option<Shown> {
         let Revolving { evidence, size, voxel, course, .. } = self.of;
         let carved =
-            turning.map(|turning| Hull::of(evidence, (*size, *voxel), &turning.about(course, self.middle)));
+            turning.map(|turning| Hull::of(evidence, *size, *voxel, &turning.about(course, self.middle)));
         let hull = carved.as_ref().unwrap_or(&self.hull);
-        Shown::of(evidence, Cells::Edged(*voxel), |look, pixel| self.place(look, pixel, (hull, turning)))
+        Shown::of(evidence, Cells::Edged(*voxel), |look, pixel| self.place(look, pixel, hull, turning))
     }
 
     /// The place from the middle that a pixel shows of a hull with some turns, before these, with the cosine at which it is
@@ -127,7 +128,8 @@ impl Solid<'_, '_> {
         &self,
         look: &Look<'_>,
         pixel: &Pixel,
-        (hull, turning): (&Hull, Option<&Turning>),
+        hull: &Hull,
+        turning: Option<&Turning>,
     ) -> Option<(DVec3, f64)> {
         let time = look.view.time_index;
         let pose = self.of.course.get(&time)?;

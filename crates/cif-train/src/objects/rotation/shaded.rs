@@ -33,7 +33,8 @@ struct Shaded {
 /// Absolute residuals of the brightness under the shaded model on left-out pixels; light is fitted to all, within cells.
 pub(super) fn shaded(
     evidence: &Evidence<'_>,
-    (hits, cells): (&[Option<Hit>], usize),
+    hits: &[Option<Hit>],
+    cells: usize,
     course: &Course,
 ) -> Vec<f32> {
     let mut found = vec![f32::NAN; hits.len()];

@@ -32,7 +32,8 @@ fn poses(course: &Course) -> Vec<(DQuat, DVec3)> {
 
 /// Courses with turns about an axis, none first, and the verdict about a ball that follows one of them.
 fn judged(
-    (truth, turns): (f64, &[f64]),
+    truth: f64,
+    turns: &[f64],
     axis: DVec3,
     place: impl Fn(usize) -> DVec3 + Copy,
     color: fn(DVec3) -> [f32; 3],
@@ -56,7 +57,7 @@ fn stays(_: usize) -> DVec3 {
 #[test]
 fn turns_in_place_are_observed_by_texture_alone() {
     for (k, cameras) in [(3, moving as Cameras), (8, rig as Cameras), (6, jumping as Cameras)] {
-        let found = judged((TURNS[k] + 5.0, &TURNS), DVec3::Z, stays, patches, cameras);
+        let found = judged(TURNS[k] + 5.0, &TURNS, DVec3::Z, stays, patches, cameras);
         assert!(found.best == k && found.is_observed, "{k}: {found:?}");
     }
 }
@@ -64,7 +65,7 @@ fn turns_in_place_are_observed_by_texture_alone() {
 #[test]
 fn what_stays_is_not_seen_to_turn() {
     for cameras in [moving as Cameras, rig as Cameras, jumping as Cameras] {
-        let found = judged((0.0, &TURNS), DVec3::Z, stays, patches, cameras);
+        let found = judged(0.0, &TURNS, DVec3::Z, stays, patches, cameras);
         assert_eq!(found.best, 0, "{found:?}");
     }
 }
@@ -75,7 +76,7 @@ fn what_rolls_is_not_judged_to_slide_and_the_reverse() {
     let rolls = (0.3 / RADIUS) * 180.0 / PI;
     let turns = [0.0, 0.5 * rolls, 0.75 * rolls, rolls, 1.25 * rolls, -rolls];
     for (k, cameras) in [(3, moving as Cameras), (3, rig as Cameras), (0, rig as Cameras)] {
-        let found = judged((turns[k], &turns), DVec3::Y, place, patches, cameras);
+        let found = judged(turns[k], &turns, DVec3::Y, place, patches, cameras);
         assert!(found.best == k && (found.is_observed || k == 0), "{k}: {found:?}");
     }
 }
@@ -83,7 +84,7 @@ fn what_rolls_is_not_judged_to_slide_and_the_reverse() {
 #[test]
 fn a_plain_ball_shows_no_turn() {
     for cameras in [moving as Cameras, rig as Cameras] {
-        let found = judged((135.0, &TURNS), DVec3::Z, stays, |_| [0.7, 0.5, 0.3], cameras);
+        let found = judged(135.0, &TURNS, DVec3::Z, stays, |_| [0.7, 0.5, 0.3], cameras);
         assert!(!found.is_observed || found.best == 0, "{found:?}");
     }
 }
@@ -96,7 +97,8 @@ fn shading_of_a_plain_ball_that_rolls_is_told_from_a_turn() {
     let of = |color: fn(DVec3) -> [f32; 3], claimed: f64| {
         let seen = views(solid(&sphere_places(RADIUS), color, 0.007), &poses(&rolls(whole)), moving);
         shown(
-            (&seen, RADIUS),
+            &seen,
+            RADIUS,
             &rolls(claimed),
             rolls(0.0),
             [0.5, 0.75, 1.0, 1.25].map(|share| rolls(share * whole)),
@@ -153,7 +155,7 @@ fn about_x(course: &Course, near: &[f64]) -> Vec<f64> {
 /// Mean error of the turns that are found, radians; both are relative to the first.
 fn rolled_error(slips: f64, color: fn(DVec3) -> [f32; 3], cameras: Cameras) -> f64 {
     let (seen, course, truth) = rolled_cylinder(slips, color, cameras);
-    let revolving = Revolving::new(seen.iter(), 0.08, &course, (DVec3::Z, Some(0.022))).unwrap();
+    let revolving = Revolving::new(seen.iter(), 0.08, &course, DVec3::Z, Some(0.022)).unwrap();
     let found = about_x(&revolving.rolled(-DVec3::X).unwrap(), &truth);
     let error = |(turn, truth): (&f64, &f64)| (turn - found[0] - truth).abs();
     found.iter().zip(&truth).map(error).sum::<f64>() / TIMES as f64
@@ -173,7 +175,7 @@ fn what_rolls_on_its_side_shows_how_far_by_its_paint() {
 #[test]
 fn what_lies_is_a_solid_of_revolution_about_no_upright_axis() {
     let (seen, course, _) = rolled_cylinder(1.0, patches, moving);
-    let revolving = Revolving::new(seen.iter(), 0.08, &course, (DVec3::Z, None)).unwrap();
+    let revolving = Revolving::new(seen.iter(), 0.08, &course, DVec3::Z, None).unwrap();
     let [lying, upright] = [-DVec3::X, DVec3::Z].map(|axis| revolving.covered(axis));
     assert!(lying > 0.85 && upright < 0.5, "{lying}, {upright}");
     // What stands is none about an axis across its way.
@@ -181,7 +183,7 @@ fn what_lies_is_a_solid_of_revolution_about_no_upright_axis() {
     let course = self::course(0.0, DVec3::Z, place);
     let standing: Vec<DVec3> = cylinder(0.16, 0.03).iter().map(|p| DVec3::new(p.z, p.y, p.x)).collect();
     let seen = views(solid(&standing, patches, 0.003), &poses(&course), moving);
-    let revolving = Revolving::new(seen.iter(), 0.08, &course, (DVec3::Z, None)).unwrap();
+    let revolving = Revolving::new(seen.iter(), 0.08, &course, DVec3::Z, None).unwrap();
     let [lying, upright] = [-DVec3::X, DVec3::Z].map(|axis| revolving.covered(axis));
     assert!(upright > 0.85 && lying < 0.7, "{lying}, {upright}");
 }
