@@ -47,12 +47,13 @@ pub(crate) struct HeadTarget {
 }
 
 impl HeadTarget {
-    /// Loss of a head on what it blends to, and its gradient times `weight`.
+    /// Loss of a head on what it blends to, and its gradient times `weight`; `seed` names its random choices.
     pub(crate) fn loss(
         &self,
         head: &dyn ValueHead,
         tensors: &mut HeadTensors,
-        (blended, seed): (&BlendedImage, u64),
+        blended: &BlendedImage,
+        seed: u64,
         weight: f32,
         v_blended: &mut [f32],
     ) -> HeadLoss {

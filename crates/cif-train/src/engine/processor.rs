@@ -213,8 +213,8 @@ impl Processor {
         let request = BlendRequest { values: &values.values[..], channels, blending };
         let blended = self.renderer.blend(&request);
         let mut v_blended = vec![0.0; blended.values.len()];
-        let of_target = (&blended, plan.head_seed(config, position));
-        let loss = target.loss(head, tensors, of_target, plan.view_weight(), &mut v_blended);
+        let seed = plan.head_seed(config, position);
+        let loss = target.loss(head, tensors, &blended, seed, plan.view_weight(), &mut v_blended);
         let mut v_values = vec![0.0; values.values.len()];
         let weights = head.own_opacity().map(|_| BlendWeightGradients {
             field,
@@ -333,10 +333,9 @@ impl Engine for Processor {
             let mut rendered =
                 self.renderer.render(field, &frame.camera, frame.time, views.settings, channels);
             if let Some(head) = by_values {
-                let of = (head, &state.head_tensors);
-                let view = (&frame.camera, frame.time);
-                let blended = heads::blended(&mut self.renderer, of, field, view, views.settings);
-                let image = heads::instance_image(head, &state.head_tensors, &blended, &rendered.alpha);
+                let (view, tensors) = ((&frame.camera, frame.time), &state.head_tensors);
+                let blended = heads::blended(&mut self.renderer, head, tensors, field, view, views.settings);
+                let image = heads::instance_image(head, tensors, &blended, &rendered.alpha);
                 rendered.instances = Some(image);
             }
             each(state.recorded(*index, rendered));

@@ -39,7 +39,8 @@ pub fn grown(
     dataset: &Dataset,
     config: &TrainConfig,
     scene: Option<Field>,
-    (gaussians, moving): (usize, f64),
+    gaussians: usize,
+    moving: f64,
     limit: Duration,
 ) -> Result<Grown, TrainError> {
     let mut config = config.clone();

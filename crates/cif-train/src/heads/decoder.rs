@@ -79,7 +79,7 @@ impl Decoder {
         view: (&PinholeCamera, f64),
         settings: &RenderSettings,
     ) -> BlendedImage {
-        blended(renderer, (self.values(), &self.tensors), field, view, settings)
+        blended(renderer, self.values(), &self.tensors, field, view, settings)
     }
 
     fn values(&self) -> &dyn ValueHead {

@@ -272,7 +272,8 @@ pub trait ValueHead: Send + Sync {
     fn rearrange(
         &self,
         _part: u32,
-        _step: (u32, u32),
+        _step: u32,
+        _steps: u32,
         _views: &mut TrainingViews<'_>,
         _random: &mut Pcg64,
     ) -> Result<Option<Rearrangement>, TrainError> {

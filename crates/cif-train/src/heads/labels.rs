@@ -11,7 +11,8 @@ use super::tensors::HeadTensors;
 /// The values of a head blended over a view by `renderer`, which `settings` without instances are for.
 pub(crate) fn blended(
     renderer: &mut Renderer,
-    (head, tensors): (&dyn ValueHead, &HeadTensors),
+    head: &dyn ValueHead,
+    tensors: &HeadTensors,
     field: &Field,
     (camera, time): (&PinholeCamera, f64),
     settings: &RenderSettings,

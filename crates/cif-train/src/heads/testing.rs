@@ -63,7 +63,8 @@ pub(crate) fn regulariser(
     head: &dyn ValueHead,
     tensors: &mut HeadTensors,
     field: &Field,
-    (step, positions): (u32, &[[f32; 3]]),
+    step: u32,
+    positions: &[[f32; 3]],
 ) -> f64 {
     tensors.reset();
     let values = every_value(head, tensors, field);

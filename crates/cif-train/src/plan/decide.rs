@@ -283,8 +283,10 @@ impl Plan<'_> {
         let found = self.found.exposures.filter(|found| found.cameras > 1)?;
         Some(self.exposed(
             EffectKind::Exposure,
-            (found.between_cameras, self.config.effects.exposure),
-            (format!("of {} cameras, two differ by", found.cameras), "camera"),
+            found.between_cameras,
+            self.config.effects.exposure,
+            &format!("of {} cameras, two differ by", found.cameras),
+            "camera",
         ))
     }
 
@@ -292,18 +294,15 @@ impl Plan<'_> {
         let factor = self.found.exposures?.in_time?;
         Some(self.exposed(
             EffectKind::ExposureInTime,
-            (factor, self.config.effects.exposure_in_time),
-            ("two images of a camera differ by".to_owned(), "training image"),
+            factor,
+            self.config.effects.exposure_in_time,
+            "two images of a camera differ by",
+            "training image",
         ))
     }
 
     /// Exposures, by a factor in how bright the same points are recorded.
-    fn exposed(
-        &self,
-        kind: EffectKind,
-        (factor, is_preset): (f64, bool),
-        (who, each): (String, &str),
-    ) -> Effect {
+    fn exposed(&self, kind: EffectKind, factor: f64, is_preset: bool, who: &str, each: &str) -> Effect {
         let preset = if is_preset { Extent::Full } else { Extent::Off };
         self.decided(Case {
             kind,

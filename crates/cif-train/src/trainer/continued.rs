@@ -64,7 +64,8 @@ fn continued(poses: &[TrackPose], time: f64, reach: f64) -> Option<TrackPose> {
 fn continue_tracks(
     tracks: &mut Tracks,
     moments: &mut PoseMoments,
-    (span, times): (&Span, &[f64]),
+    span: &Span,
+    times: &[f64],
     is_in_view: impl Fn(&TrackPose) -> bool,
 ) -> bool {
     let mut place = 0;
@@ -121,7 +122,7 @@ impl Trainer {
             let mut then = trained.iter().filter(|frame| frame.time == pose.time);
             then.any(|frame| frame.camera.pixel_of(pose.translation).is_some())
         };
-        if continue_tracks(tracks, &mut state.pose_moments, (&span, &state.dataset.times), is_in_view) {
+        if continue_tracks(tracks, &mut state.pose_moments, &span, &state.dataset.times, is_in_view) {
             state.gradients = Gradients::zeros(&state.field);
         }
     }
@@ -195,7 +196,7 @@ mod tests {
     }
 
     fn go_on(tracks: &mut Tracks, moments: &mut PoseMoments) -> bool {
-        continue_tracks(tracks, moments, (&SPAN, &TIMES), |_| true)
+        continue_tracks(tracks, moments, &SPAN, &TIMES, |_| true)
     }
 
     #[test]
@@ -207,7 +208,7 @@ mod tests {
         // At 0.2 they would be in view, but nothing is seen of them.
         let is_in_view = |pose: &TrackPose| pose.translation.x < 0.5;
         for _ in 0..2 {
-            continue_tracks(&mut tracks, &mut moments, (&SPAN, &times), is_in_view);
+            continue_tracks(&mut tracks, &mut moments, &SPAN, &times, is_in_view);
             for group in &tracks.groups {
                 assert_eq!(group.poses.iter().map(|pose| pose.time).collect::<Vec<_>>(), times[1..]);
                 assert!(group.poses.iter().all(|pose| (pose.translation.x - 2.0 * pose.time).abs() < 1e-9));

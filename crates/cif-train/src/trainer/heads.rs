@@ -76,17 +76,17 @@ impl Trainer {
         let (before, told) = (self.state.keep(), events.len());
         let mut random = stream(self.state.config.seed, Purpose::HeadRearrangements, u64::from(iteration));
         for part in 0..parts {
-            let change =
-                match head.rearrange(part, (iteration, steps), &mut self.training_views(), &mut random) {
-                    Ok(Some(change)) => change,
-                    Ok(None) => continue,
-                    Err(error) => {
-                        self.state.put_back(before);
-                        events.truncate(told);
-                        self.engine.changed(Changed::Everything);
-                        return Err(error);
-                    }
-                };
+            let change = match head.rearrange(part, iteration, steps, &mut self.training_views(), &mut random)
+            {
+                Ok(Some(change)) => change,
+                Ok(None) => continue,
+                Err(error) => {
+                    self.state.put_back(before);
+                    events.truncate(told);
+                    self.engine.changed(Changed::Everything);
+                    return Err(error);
+                }
+            };
             if change.gaussians.is_empty() {
                 return Err(TrainError::NoGaussians { stage, iteration });
             }

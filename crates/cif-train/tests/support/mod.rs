@@ -115,7 +115,8 @@ pub(crate) fn relative_gain(view: usize) -> [f64; 3] {
 fn write_frame(
     camera: &PinholeCamera,
     scene: Scene,
-    (time, gain): (f64, [f64; 3]),
+    time: f64,
+    gain: [f64; 3],
     image: &Path,
     mask: Option<&Path>,
 ) {
@@ -188,7 +189,7 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
                 (true, true) => [0.8; 3],
                 (true, false) => relative_gain(view).map(|gain| 0.8 * gain),
             };
-            write_frame(&camera, scene, (*time, gain), &image, mask.as_deref());
+            write_frame(&camera, scene, *time, gain, &image, mask.as_deref());
             if let Some(mask) = mask.as_ref().filter(|_| scene.empty_masks) {
                 image::GrayImage::new(camera.width, camera.height).save(mask).unwrap();
             }

@@ -77,8 +77,8 @@ impl GpuEngine {
                 values: blended.read(gpu)?,
             };
             let mut v_blended = vec![0.0; image.values.len()];
-            let of_target = (&image, plan.head_seed(config, position));
-            let loss = target.loss(head, tensors, of_target, plan.view_weight(), &mut v_blended);
+            let seed = plan.head_seed(config, position);
+            let loss = target.loss(head, tensors, &image, seed, plan.view_weight(), &mut v_blended);
             reports.push(ViewReport::of_head(loss));
             let v_blended = GpuVec::from_slice(gpu, "gradients of blended values", &v_blended)?;
             let v_values = GpuVec::zeros(gpu, "gradients of values", values.values.len())?;

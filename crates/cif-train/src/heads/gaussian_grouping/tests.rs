@@ -18,11 +18,11 @@ fn gradients_are_those_of_double_precision() {
 
     // Fewer Gaussians than are sampled: all of them are.
     let positions = field.deformed(TIME).means;
-    let value = regulariser(&GaussianGrouping, &mut tensors, &field, (10, &positions));
+    let value = regulariser(&GaussianGrouping, &mut tensors, &field, 10, &positions);
     let oracle = |values: &[Vec<f64>]| neighbour_term(&values[0], &values[1], &values[2], &positions);
     assert!((value / oracle(&start) - 1.0).abs() < 1e-4, "{value}");
     check_gradients(&GaussianGrouping, &mut tensors, 7, &oracle);
-    let between = regulariser(&GaussianGrouping, &mut tensors, &field, (11, &positions));
+    let between = regulariser(&GaussianGrouping, &mut tensors, &field, 11, &positions);
     assert_eq!(between, 0.0, "every fifth");
 }
 

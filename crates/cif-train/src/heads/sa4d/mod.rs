@@ -107,7 +107,7 @@ impl ValueHead for Sa4d {
             (0..rows.len()).filter(|place| v_code(place).iter().any(|v| *v != 0.0)).collect();
         let v_codes: Vec<f32> = places.iter().flat_map(v_code).copied().collect();
         let (network, gradients) = tensors.values_and_gradients(&NETWORK);
-        self.network.backward(network, layers, (&places, &v_codes), gradients);
+        self.network.backward(network, layers, &places, &v_codes, gradients);
     }
 
     fn loss(

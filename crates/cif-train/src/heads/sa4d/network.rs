@@ -131,7 +131,8 @@ impl Network {
         &self,
         network: &[f32],
         layers: &[Layers],
-        (places, v_codes): (&[usize], &[f32]),
+        places: &[usize],
+        v_codes: &[f32],
         gradients: &mut [f32],
     ) {
         let transposed: Vec<Vec<f32>> = (0..LAYERS)

@@ -43,7 +43,7 @@ fn gradients_are_those_of_double_precision() {
     check_gradients(&head, &mut tensors, 1_511, &oracle);
 
     let positions = field.deformed(TIME).means;
-    assert!(regulariser(&head, &mut tensors, &field, (11, &positions)) > 0.0, "at every step");
+    assert!(regulariser(&head, &mut tensors, &field, 11, &positions) > 0.0, "at every step");
     let oracle =
         |values: &[Vec<f64>]| neighbour_term(&codes(&values[0], &means), &values[1], &values[2], &positions);
     check_gradients(&head, &mut tensors, 1_511, &oracle);

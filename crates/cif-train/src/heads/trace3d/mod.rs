@@ -210,7 +210,7 @@ impl ValueHead for Trace3d {
         let (field, settings) = (views.field(), views.settings());
         views.each_masked(&|camera| self.trains_on(camera), &mut |renderer, frame, labels| {
             let view = (&frame.camera, frame.time);
-            let blended = blended(renderer, (self, tensors), field, view, &settings);
+            let blended = blended(renderer, self, tensors, field, view, &settings);
             for (code, label) in blended.pixels().zip(&labels.pixels) {
                 let Some(label) = usize::from(*label).checked_sub(1) else { continue };
                 pixels[label] += 1.0;
@@ -235,7 +235,8 @@ impl ValueHead for Trace3d {
     fn rearrange(
         &self,
         part: u32,
-        (step, steps): (u32, u32),
+        step: u32,
+        steps: u32,
         views: &mut TrainingViews<'_>,
         random: &mut Pcg64,
     ) -> Result<Option<Rearrangement>, TrainError> {

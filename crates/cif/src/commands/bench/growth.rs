@@ -146,9 +146,9 @@ pub(super) fn run(command: &BenchGrowth) -> Result<(), Error> {
         let config = trained.unwrap_or_else(|| TrainConfig::preset(Preset::default(), dataset.layout));
         for gaussians in &command.gaussians {
             let moving = f64::from(command.moving) / 100.0;
-            let wanted = (*gaussians as usize, moving);
-            let measured = grown(&dataset, &config, field.clone(), wanted, LIMIT).map_err(Error::plain)?;
-            cells.push(Cell::of(&measured));
+            let count = *gaussians as usize;
+            let measured = grown(&dataset, &config, field.clone(), count, moving, LIMIT);
+            cells.push(Cell::of(&measured.map_err(Error::plain)?));
         }
     }
     command.report.give(|| Growth::of(&cells), || Growth::of(&cells).print())
