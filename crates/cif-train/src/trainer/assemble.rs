@@ -13,7 +13,7 @@ use super::measured_frames::MeasuredFrames;
 use super::saved::inputs_of;
 use super::saving::Saving;
 use super::{Trainer, initialize, near};
-use crate::config::{HeadName, TrainConfig};
+use crate::config::{DensifyConfig, HeadName, MotionConfig, TrainConfig};
 use crate::density::{self, DensifyStatistics};
 use crate::detail;
 use crate::effects;
@@ -28,6 +28,7 @@ use crate::heads::{HeadTensors, configured};
 use crate::objects::KnownObjects;
 use crate::optimiser::Optimiser;
 use crate::phase::Phase;
+use crate::phases::Phases;
 use crate::poses::PoseMoments;
 use crate::progress::Progress;
 use crate::schedule::Stages;
@@ -77,6 +78,65 @@ fn switch_note(dataset: &Dataset, switched: &BTreeMap<usize, BTreeMap<u16, u16>>
             found.join(", ")
         ))
     })
+}
+
+/// Checks the masks of training frames as far as the settings ask for it, and changes those that are wrong; with messages
+/// about what was found.
+///
+/// # Errors
+/// When a frame cannot be read, or the run is to stop.
+fn put_masks_right(
+    frames: &mut FrameStore,
+    dataset: &Dataset,
+    motion: &MotionConfig,
+    phases: &Phases,
+) -> Result<Vec<TrainEvent>, TrainError> {
+    let mut messages = Vec::new();
+    let finds_misfits = motion.misfit > 0.0;
+    let reads = finds_misfits || motion.switches;
+    if !reads && !motion.edges {
+        return Ok(messages);
+    }
+    let passes = usize::from(reads) + usize::from(motion.edges);
+    let _phase = phases.enter(Phase::Masks, passes * frames.len());
+    let mut read = Vec::new();
+    if reads {
+        read = frames.read_masks(dataset, motion.switches, phases)?;
+    }
+    if finds_misfits {
+        let left_out = frames.leave_out_misfits(dataset, &mut read, f64::from(motion.misfit));
+        messages.extend(misfit_warning(dataset, &left_out));
+    }
+    if motion.switches {
+        messages.extend(switch_note(dataset, frames.put_switches_right(read)));
+    }
+    if motion.edges && frames.put_edges_right(dataset, phases)? {
+        messages.push(TrainEvent::note(
+            "outlines of masks are rough, and were moved to where the colours change (motion.edges = false keeps \
+             them)",
+        ));
+    }
+    Ok(messages)
+}
+
+/// Allows more Gaussians where images show much detail, with a note that says so.
+///
+/// # Errors
+/// When a frame cannot be read.
+fn allow_detail(
+    densify: &mut DensifyConfig,
+    dataset: &Dataset,
+    frames: &FrameStore,
+) -> Result<Option<TrainEvent>, TrainError> {
+    let found = detail::most_gaussians(dataset, frames, densify)?;
+    densify.detail = 0.0;
+    Ok(found.map(|(most, pixels)| {
+        let before = std::mem::replace(&mut densify.max_gaussians, most);
+        TrainEvent::note(format!(
+            "images show much detail, {pixels} pixels that half the size would not show: up to {most} Gaussians \
+             instead of {before} (--max-gaussians sets another number)"
+        ))
+    }))
 }
 
 impl Trainer {
@@ -132,38 +192,10 @@ impl Trainer {
         let has_instances =
             config.effects.instances && !dataset.instances.is_empty() && frames.has_labels(&dataset);
         let mut messages = Vec::new();
-        let motion = &config.motion;
-        let checks = [motion.misfit > 0.0, motion.switches, motion.edges].map(|on| on && has_instances);
-        if checks.contains(&true) {
-            let passes = usize::from(checks[0] || checks[1]) + usize::from(checks[2]);
-            let _phase = phases.enter(Phase::Masks, passes * frames.len());
-            let mut read = Vec::new();
-            if checks[0] || checks[1] {
-                read = frames.read_masks(&dataset, checks[1], &phases)?;
-            }
-            if checks[0] {
-                let left_out = frames.leave_out_misfits(&dataset, &mut read, f64::from(motion.misfit));
-                messages.extend(misfit_warning(&dataset, &left_out));
-            }
-            if checks[1] {
-                messages.extend(switch_note(&dataset, frames.put_switches_right(read)));
-            }
-            if checks[2] && frames.put_edges_right(&dataset, &phases)? {
-                messages.push(TrainEvent::note(
-                    "outlines of masks are rough, and were moved to where the colours change (motion.edges = false \
-                     keeps them)",
-                ));
-            }
+        if has_instances {
+            messages.extend(put_masks_right(&mut frames, &dataset, &config.motion, &phases)?);
         }
-        if let Some((most, pixels)) = detail::most_gaussians(&dataset, &frames, &config.densify)? {
-            messages.push(TrainEvent::note(format!(
-                "images show much detail, {pixels} pixels that half the size would not show: up to {most} Gaussians \
-                 instead of {} (--max-gaussians sets another number)",
-                config.densify.max_gaussians
-            )));
-            config.densify.max_gaussians = most;
-        }
-        config.densify.detail = 0.0;
+        messages.extend(allow_detail(&mut config.densify, &dataset, &frames)?);
         let near = match config.near {
             0.0 => field.record.drawing.near.unwrap_or_else(|| near::automatic(&dataset)),
             near => near,
