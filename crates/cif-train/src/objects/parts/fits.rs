@@ -14,9 +14,9 @@ use super::promise::LOOKS;
 use super::scope::Search;
 use super::search::search;
 
-/// Effort that a fit of base and part takes.
+/// Gaussians and steps of a fit of base and part.
 #[derive(Clone, Copy)]
-pub(super) struct Effort {
+pub(super) struct Budget {
     /// Gaussians of the base.
     pub(super) base: usize,
     /// Gaussians of the part.
@@ -24,8 +24,8 @@ pub(super) struct Effort {
     pub(super) steps: usize,
 }
 
-/// Effort of fine fits.
-pub(super) const FINELY: Effort = Effort { base: 500, part: 250, steps: 500 };
+/// Budget of fine fits.
+pub(super) const FINELY: Budget = Budget { base: 500, part: 250, steps: 500 };
 
 /// Places of a hinge that are tried about that of a fit: steps to each side of it, and a step, of the size.
 const PLACES: i32 = 3;
@@ -60,20 +60,20 @@ impl<'a> Search<'a> {
         &self,
         guess: Guess,
         values: &BTreeMap<usize, f64>,
-        effort: Effort,
+        budget: Budget,
         level: usize,
     ) -> Option<Fit<'a>> {
         let hinge = guess.hinge;
-        let mut base = self.hull(self.base, None, effort.base)?;
+        let mut base = self.hull(self.base, None, budget.base)?;
         base.fade(FAINT, |place| guess.has(place, 0.0));
         let margin = 0.1 * self.size;
         let inside = |place: DVec3| guess.has(place, margin);
-        let mut part = self.hull(&self.posed(hinge, values), Some(&inside), effort.part)?;
+        let mut part = self.hull(&self.posed(hinge, values), Some(&inside), budget.part)?;
         part.fade(FAINT, |place| !guess.has(place, 0.0));
         let mut body = self.together(base, &part, hinge, values);
         body.steps(
             &self.views.train,
-            effort.steps,
+            budget.steps,
             level,
             |share| if share < 0.2 { (1.0, 0.0) } else { (1.0, 1.0) },
         );

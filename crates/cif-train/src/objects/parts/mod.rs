@@ -33,7 +33,7 @@ use rayon::prelude::*;
 
 use self::body::Hinge;
 pub(crate) use self::fits::Jointed;
-use self::fits::{Effort, FINELY, Fit, keep_kinds};
+use self::fits::{Budget, FINELY, Fit, keep_kinds};
 use self::guesses::Guess;
 use self::scope::Search;
 use super::discs;
@@ -51,9 +51,9 @@ const FEWEST_TIMES: usize = 8;
 const GAUSSIANS: usize = 300;
 const STEPS: usize = 300;
 
-/// Guesses that are fitted, and the effort that this takes between searches.
+/// Guesses that are fitted, and the budget of this, its steps between searches.
 const FITTED: usize = 12;
-const FIT: Effort = Effort { base: 200, part: 150, steps: 250 };
+const FIT: Budget = Budget { base: 200, part: 150, steps: 250 };
 
 /// Of these, those whose values are searched for again, and those that are fitted finely.
 const AGAIN: usize = 8;
