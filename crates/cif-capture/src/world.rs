@@ -1,5 +1,7 @@
 //! The direction of up and the length of a metre: poses from images alone give neither.
 
+use cif_geometry::Ray;
+use cif_geometry::rays::nearest_point;
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::Error;
@@ -12,6 +14,9 @@ const SPANS: f64 = 0.02;
 
 /// Cameras are held upright where the mean of their own up directions is at least this long along the estimate.
 const UPRIGHT: f64 = 0.3;
+
+/// Sine of the widest angle between rays from which they show where they meet.
+const CROSSES: f64 = 0.02;
 
 /// The direction against gravity, from the cameras: their rows of pixels are level, so that up is
 /// perpendicular to all of them; `None` where the cameras were not held so.
@@ -61,9 +66,7 @@ pub struct Click {
 /// # Errors
 /// When an image has no pose, there are fewer than two, or the rays are nearly parallel.
 pub fn meet(poses: &Poses, clicks: &[Click]) -> Result<DVec3, Error> {
-    let mut normal = DMat3::ZERO;
-    let mut right = DVec3::ZERO;
-    let mut directions = Vec::new();
+    let mut rays = Vec::new();
     for click in clicks {
         let pose = crate::times::entry(&poses.images, &click.image).ok_or_else(|| {
             Error::refused(
@@ -77,27 +80,23 @@ pub fn meet(poses: &Poses, clicks: &[Click]) -> Result<DVec3, Error> {
             (click.pixel.y - lens.principal_px[1]) / lens.focal_px[1],
         );
         let ideal = lens.distortion.undistort(plane).unwrap_or(plane);
-        let ray = (pose.world_from_camera.rotation * ideal.extend(1.0)).normalize();
-        // Least squares of distances to the rays.
-        let across = DMat3::IDENTITY - DMat3::from_cols(ray * ray.x, ray * ray.y, ray * ray.z);
-        normal += across;
-        right += across * pose.world_from_camera.translation;
-        directions.push(ray);
+        let direction = (pose.world_from_camera.rotation * ideal.extend(1.0)).normalize();
+        rays.push(Ray::new(pose.world_from_camera.translation, direction));
     }
-    let widest = directions
+    let widest = rays
         .iter()
-        .flat_map(|a| directions.iter().map(move |b| a.cross(*b).length()))
+        .flat_map(|a| rays.iter().map(|b| a.direction.cross(b.direction).length()))
         .fold(0.0, f64::max);
-    if widest < 0.02 {
-        return Err(Error::refused(
+    let met = nearest_point(rays.iter().map(|ray| (*ray, 1.0)), 0.0);
+    met.filter(|_| widest >= CROSSES).ok_or_else(|| {
+        Error::refused(
             format!(
                 "{} clicks see the point from nearly one direction, so that it has no depth",
                 clicks.len()
             ),
             "click the same point in two or more images from different sides",
-        ));
-    }
-    Ok(normal.inverse() * right)
+        )
+    })
 }
 
 /// The scale by which a length between two places becomes `metres`.

@@ -9,6 +9,7 @@
 //! | [`quaternion`] | rotation of a (w, x, y, z) quaternion, with derivative |
 //! | [`spherical_harmonics`] | view-dependent colour basis, degrees 0 to 3, with derivative and rotation |
 //! | [`camera`] | ideal pinhole cameras |
+//! | [`rays`] | how far points are from rays, and where rays meet |
 //! | [`capture_frame`] | where coordinates lie in the world of a capture |
 //! | [`lens`] | lens distortion and its removal |
 //! | [`time_window`] | which times of a long capture are trained together |
@@ -28,6 +29,7 @@ pub mod grid;
 pub mod lens;
 pub mod overlap;
 pub mod quaternion;
+pub mod rays;
 pub mod scalar;
 pub mod spherical_harmonics;
 pub mod stats;
@@ -41,6 +43,7 @@ pub use camera::PinholeCamera;
 pub use capture_frame::CaptureFrame;
 pub use grid::PixelGrid;
 pub use lens::LensDistortion;
+pub use rays::Ray;
 pub use scalar::Real;
 pub use time_window::TimeWindow;
 pub use transform::RigidTransform;

@@ -5,9 +5,10 @@
 //! distance changes, and real objects neither jump nor change speed without cause. The path is the robust
 //! least-squares solution of all three with the directions in which the mask's centre is seen.
 
-use cif_geometry::PinholeCamera;
+use cif_geometry::rays::nearest_point;
 use cif_geometry::stats::median;
-use glam::{DMat3, DVec2, DVec3};
+use cif_geometry::{PinholeCamera, Ray};
+use glam::{DVec2, DVec3};
 
 mod misfits;
 
@@ -31,6 +32,11 @@ pub struct Observation {
 }
 
 impl Observation {
+    /// The ray through the centre of the mask.
+    fn ray(&self) -> Ray {
+        Ray::through(&self.camera, self.centroid_px)
+    }
+
     /// Radius of a disc as large as the mask, pixels.
     fn radius_px(&self) -> f64 {
         (self.area_px / std::f64::consts::PI).sqrt()
@@ -91,39 +97,12 @@ const TRAVEL: f64 = 0.3;
 
 /// The point nearest to all rays through the masks' centres.
 fn fixed_point(observations: &[Observation]) -> DVec3 {
-    let rays = observations.iter().map(|o| (&o.camera, o.centroid_px, 1.0));
-    nearest_to_rays(rays, PARALLEL).unwrap_or_else(|| observations[0].camera.centre())
+    let rays = observations.iter().map(|o| (o.ray(), 1.0));
+    nearest_point(rays, PARALLEL).unwrap_or_else(|| observations[0].camera.centre())
 }
 
 /// Determinant below which rays count as parallel.
 const PARALLEL: f64 = 1e-12;
-
-/// The point nearest to rays through pixels of cameras, by weights; `None` where the determinant of the sum of the
-/// projections across them is below `least`: where they are about parallel.
-pub(crate) fn nearest_to_rays<'a>(
-    rays: impl Iterator<Item = (&'a PinholeCamera, DVec2, f64)>,
-    least: f64,
-) -> Option<DVec3> {
-    let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
-    for (camera, pixel, weight) in rays {
-        let across = weight * across(camera, pixel);
-        normal += across;
-        right += across * camera.centre();
-    }
-    (normal.determinant().abs() >= least).then(|| normal.inverse() * right)
-}
-
-/// Distance of a point from the ray through a pixel, metres.
-pub(crate) fn distance_to_ray(camera: &PinholeCamera, pixel: DVec2, point: DVec3) -> f64 {
-    (across(camera, pixel) * (point - camera.centre())).length()
-}
-
-/// Projection onto the plane across the ray through a pixel.
-pub(crate) fn across(camera: &PinholeCamera, pixel: DVec2) -> DMat3 {
-    let direction = camera.ray(pixel).normalize();
-    DMat3::IDENTITY
-        - DMat3::from_cols(direction * direction.x, direction * direction.y, direction * direction.z)
-}
 
 /// The path of an instance; `None` with too few observations. Without any contact it is taken to be about as
 /// far as the fixed point that explains its masks best, and `None` where that is behind the cameras.

@@ -1,7 +1,8 @@
 //! Random points for captures that bring none.
 
-use cif_geometry::PinholeCamera;
-use glam::{DMat3, DVec2, DVec3};
+use cif_geometry::rays::nearest_point;
+use cif_geometry::{PinholeCamera, Ray};
+use glam::{DVec2, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
@@ -59,15 +60,8 @@ fn viewed_box(cameras: &[PinholeCamera]) -> (DVec3, f64) {
     let count = cameras.len().max(1) as f64;
     let mean: DVec3 = cameras.iter().map(PinholeCamera::centre).sum::<DVec3>() / count;
     let spread = cameras.iter().map(|camera| camera.centre().distance(mean)).fold(0.0, f64::max);
-    let mut normal = DMat3::ZERO;
-    let mut right = DVec3::ZERO;
-    for camera in cameras {
-        let axis = camera.forward();
-        let across = DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
-        normal += across;
-        right += across * camera.centre();
-    }
-    let crossing = (normal.determinant() > 1e-6 * count.powi(3)).then(|| normal.inverse() * right);
+    let axes = cameras.iter().map(|camera| (Ray::new(camera.centre(), camera.forward()), 1.0));
+    let crossing = nearest_point(axes, 1e-6 * count.powi(3));
     let ahead = |point: &DVec3| {
         point.is_finite() && cameras.iter().all(|camera| camera.forward().dot(*point - camera.centre()) > 0.0)
     };
@@ -90,6 +84,7 @@ fn viewed_box(cameras: &[PinholeCamera]) -> (DVec3, f64) {
 #[cfg(test)]
 mod tests {
     use cif_geometry::RigidTransform;
+    use glam::DMat3;
 
     use super::*;
 

@@ -3,12 +3,12 @@
 
 use std::f64::consts::TAU;
 
-use cif_geometry::PinholeCamera;
+use cif_geometry::rays::meeting_point;
+use cif_geometry::{PinholeCamera, Ray};
 use glam::DVec2;
 use rand::RngExt;
 use rand_pcg::Pcg64;
 
-use super::meeting::meeting_of_rays;
 use super::rotation::Ball;
 use super::view::{Crop, ObjectView, median};
 use crate::random::{Purpose, stream};
@@ -66,9 +66,8 @@ pub(super) fn ball<'a>(views: impl Iterator<Item = &'a ObjectView>) -> Option<Ba
         return None;
     }
     let camera = |view: &'a ObjectView| &view.crops[0].camera;
-    let centre = meeting_of_rays(
-        &discs.iter().map(|(view, disc)| (camera(view), disc.middle, 1.0)).collect::<Vec<_>>(),
-    )?;
+    let ray = |(view, disc): &(&'a ObjectView, Disc)| (Ray::through(camera(view), disc.middle), 1.0);
+    let centre = meeting_point(&discs.iter().map(ray).collect::<Vec<_>>())?;
     let size = |(view, disc): &(&'a ObjectView, Disc)| {
         let distance = (centre - view.camera.centre()).length();
         distance * (disc.radius / camera(view).focal_px.x).atan().sin()

@@ -8,7 +8,6 @@
 //! | `plane`, `below` | which plane objects stand on, and which points may lie on it |
 //! | `object` | what is known of an object before it is fitted |
 //! | `outline`, `outlines`, `path` | how large an object is, and where it goes |
-//! | `meeting` | where rays through the middles of its masks meet |
 //! | `shape` | its Gaussians alone, against crops |
 //! | `hull` | where its Gaussians start |
 //! | `fit` | its poses and Gaussians, moved together |
@@ -37,7 +36,6 @@ mod follow;
 mod grow;
 mod hull;
 mod known;
-mod meeting;
 mod mend;
 mod object;
 mod order;

@@ -8,12 +8,11 @@ use rand_pcg::Pcg64;
 
 use super::fit::{Fit, Turns};
 use super::hull::hull;
-use super::meeting::meeting_point;
 use super::order::Order;
 use super::outline::Outline;
 use super::plane::Plane;
 use super::shape::{Pose, Shape};
-use super::view::{ObjectView, is_one_camera};
+use super::view::{ObjectView, is_one_camera, meeting_point};
 use super::ways::Way;
 use crate::phases::Phases;
 use crate::random::{Purpose, stream};

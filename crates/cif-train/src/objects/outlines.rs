@@ -5,11 +5,10 @@ use std::collections::BTreeMap;
 
 use glam::{DMat2, DVec2, DVec3};
 
-use super::meeting::meeting_point;
 use super::outline::{Outline, RAISED, ROOM};
 use super::path;
 use super::plane::Plane;
-use super::view::{ObjectView, WITHIN, are_discs, is_one_camera, median, rests};
+use super::view::{ObjectView, WITHIN, are_discs, is_one_camera, median, meeting_point, rests};
 
 /// Largest apparent size of a mask, relative to that on the plane, at which its object is taken to touch the plane.
 const AIR: f64 = 1.1;
@@ -490,19 +489,6 @@ mod tests {
         for time in 0..6 {
             assert!((found.path[&time] - place(time)).length() < 0.004, "{:?}", found.path[&time]);
         }
-    }
-
-    #[test]
-    fn rays_that_miss_the_others_do_not_move_the_point() {
-        let mut views = ball(1, rig);
-        let point = |views: &[ObjectView]| meeting_point(views.iter().map(|view| (view, 1.0))).unwrap();
-        let clean = point(&views);
-        views[2].centroid += DVec2::new(25.0, -10.0);
-        views[4].centroid += DVec2::new(-5.0, 30.0);
-        assert!((point(&views) - clean).length() < 0.003, "{} and {clean}", point(&views));
-        // Three cannot tell which misses.
-        views.truncate(3);
-        assert!((point(&views) - clean).length() > 0.01);
     }
 
     #[test]

@@ -8,7 +8,6 @@ use nalgebra::{DMatrix, DVector};
 
 use super::outline::Outline;
 use super::view::{ObjectView, WITHIN, are_discs, median};
-use crate::tracks::across;
 
 /// Weights of squared second differences, in steps of a 60th of the sequence: of paths that a plane cuts from rays,
 /// of those where the rays of several cameras meet, and of those where the rays of neighbouring times cross.
@@ -122,7 +121,7 @@ pub(super) fn crossing(views: &[ObjectView], times: usize) -> BTreeMap<usize, DV
 /// somewhere is found before rays are told to be off it. Nothing else tells where its ends are.
 fn along_rays(views: &[ObjectView], times: usize, bounces: bool) -> BTreeMap<usize, DVec3> {
     let mut views: Vec<&ObjectView> = views.iter().filter(|view| !view.cut).collect();
-    let rays: Vec<DVec3> = views.iter().map(|view| view.camera.ray(view.centroid).normalize()).collect();
+    let rays: Vec<DVec3> = views.iter().map(|view| view.ray().direction).collect();
     let widest = |k: usize| {
         let beside = k.saturating_sub(BESIDE)..=(k + BESIDE).min(rays.len() - 1);
         beside.map(|other| rays[k].angle_between(rays[other])).fold(0.0, f64::max)
@@ -148,7 +147,8 @@ fn along_rays(views: &[ObjectView], times: usize, bounces: bool) -> BTreeMap<usi
         let near: Vec<(DMat3, DVec3)> =
             views.iter().zip(&weights).map(|(view, weight)| ray(view, *weight)).collect();
         let Some(found) = even(&keys, &near, &stiffness, times) else { return BTreeMap::new() };
-        let distances: Vec<f64> = views.iter().map(|view| view.distance(found[&view.time_index])).collect();
+        let distances: Vec<f64> =
+            views.iter().map(|view| view.ray().distance(found[&view.time_index])).collect();
         let large = 2.0 * median(&mut distances.clone());
         for k in inner.clone().filter(|_| round >= sure) {
             weights[k] = weight(views[k]) / (1.0 + (distances[k] / large.max(1e-12)).powi(2));
@@ -181,13 +181,17 @@ fn missed(views: &[&ObjectView], at: usize, times: usize) -> Option<(f64, f64)> 
     let place = even(&keys, &rays, &vec![CROSSING; keys.len()], times)?[&views[at].time_index];
     let (view, camera) = (views[at], &views[at].camera);
     let depth = camera.project(place)?.1;
-    Some((view.distance(place) / gap.powi(2), ELSEWHERE * view.reach(WITHIN) * depth / camera.focal_px.x))
+    Some((
+        view.ray().distance(place) / gap.powi(2),
+        ELSEWHERE * view.reach(WITHIN) * depth / camera.focal_px.x,
+    ))
 }
 
 /// The ray of a view with a weight, as [`even`] takes what is near.
 fn ray(view: &ObjectView, weight: f64) -> (DMat3, DVec3) {
-    let across = weight * across(&view.camera, view.centroid);
-    (across, across * view.camera.centre())
+    let ray = view.ray();
+    let across = weight * ray.across();
+    (across, across * ray.origin)
 }
 
 /// Weight of a ray by the visible share of its view.

@@ -4,13 +4,12 @@ use std::collections::{BTreeSet, HashSet};
 use std::f64::consts::PI;
 use std::sync::Arc;
 
-use cif_geometry::{PinholeCamera, PixelGrid, stats};
+use cif_geometry::{PinholeCamera, PixelGrid, Ray, rays, stats};
 use cif_render::{RenderSettings, UNLABELLED};
 use glam::{DVec2, DVec3};
 
 use crate::frames::TrainFrame;
 use crate::mask_table::{MaskRow, MaskTable};
-use crate::tracks::distance_to_ray;
 
 /// Pixels around the mask that belong to its crop.
 const MARGIN: u32 = 5;
@@ -168,9 +167,9 @@ impl ObjectView {
         distances[((distances.len() - 1) as f64 * share) as usize]
     }
 
-    /// Distance of a point of the world from the ray through the middle of the mask, metres.
-    pub(super) fn distance(&self, point: DVec3) -> f64 {
-        distance_to_ray(&self.camera, self.centroid, point)
+    /// The ray through the middle of the mask.
+    pub(super) fn ray(&self) -> Ray {
+        Ray::through(&self.camera, self.centroid)
     }
 
     /// True where the outline is the object's own.
@@ -264,6 +263,12 @@ pub(super) fn rests(views: &[ObjectView], time: usize) -> bool {
     let before = views.iter().map(|view| view.time_index).filter(|other| *other < time).max();
     let after = views.iter().map(|view| view.time_index).filter(|other| *other > time).min();
     [before, after].into_iter().flatten().any(|other| look_alike(views, time, other))
+}
+
+/// The point where rays through the middles of masks meet, by weights; `None` where they are parallel. Masks that show more
+/// than the object, or another, count less where several others agree.
+pub(super) fn meeting_point<'a>(views: impl Iterator<Item = (&'a ObjectView, f64)>) -> Option<DVec3> {
+    rays::meeting_point(&views.map(|(view, weight)| (view.ray(), weight)).collect::<Vec<_>>())
 }
 
 /// True with one view at most of every time.

@@ -3,9 +3,10 @@
 
 use std::collections::BTreeMap;
 
+use cif_geometry::Ray;
 use glam::{DMat3, DVec3};
 
-use super::{FEWEST, Observation, across};
+use super::{FEWEST, Observation};
 
 /// Instances that a frame must show to be judged; a single one may have moved.
 const FEWEST_INSTANCES: usize = 2;
@@ -64,23 +65,21 @@ fn miss(o: &Observation, point: DVec3) -> f64 {
 /// The point with the least sum of distances from the rays through the masks' centres, as lines: some wrong rays
 /// do not move it. `None` where the rays are parallel.
 fn middle_point(observations: &[&Observation]) -> Option<DVec3> {
-    let lines: Vec<(DVec3, DMat3)> =
-        observations.iter().map(|o| (o.camera.centre(), across(&o.camera, o.centroid_px))).collect();
+    let lines: Vec<Ray> = observations.iter().map(|o| o.ray()).collect();
     let mut weights = vec![1.0; lines.len()];
     let mut point = DVec3::ZERO;
     for _ in 0..ROUNDS {
         let (mut normal, mut right, mut total) = (DMat3::ZERO, DVec3::ZERO, 0.0);
-        for ((origin, across), weight) in lines.iter().zip(&weights) {
-            normal += *across * *weight;
-            right += *across * *origin * *weight;
+        for (ray, weight) in lines.iter().zip(&weights) {
+            normal += ray.across() * *weight;
+            right += ray.across() * ray.origin * *weight;
             total += weight;
         }
         if normal.determinant() <= 1e-12 * total.powi(3) {
             return None;
         }
         point = normal.inverse() * right;
-        let distances: Vec<f64> =
-            lines.iter().map(|(origin, across)| (*across * (point - *origin)).length()).collect();
+        let distances: Vec<f64> = lines.iter().map(|ray| ray.distance(point)).collect();
         // No ray may take everything.
         let least = 1e-6 + 1e-3 * distances.iter().sum::<f64>() / distances.len() as f64;
         for (weight, distance) in weights.iter_mut().zip(&distances) {

@@ -1,4 +1,5 @@
 use cif_geometry::RigidTransform;
+use glam::DMat3;
 
 use super::*;
 

@@ -37,11 +37,11 @@ use self::fits::{Budget, FINELY, Fit, keep_kinds};
 use self::guesses::Guess;
 use self::scope::Search;
 use super::discs;
-use super::meeting::meeting_point;
 use super::object::Object;
 use super::rotation::{Turning, turning};
 use super::shape::Pose;
 use super::split::{SplitViews, times_of};
+use super::view::meeting_point;
 use crate::error::TrainError;
 
 /// Reliable times below which parts cannot be told apart.
