@@ -73,7 +73,9 @@ fn fresh_moments() -> PoseMoments {
 
 /// A pose that moves by itself, and is not among those of a fit yet.
 pub(super) struct MovingPose {
+    /// The pose as far as it has moved.
     pub(super) pose: Pose,
+    /// Of its optimiser.
     moments: PoseMoments,
 }
 
@@ -89,6 +91,7 @@ impl MovingPose {
 pub(super) struct TimedPose {
     /// Index of the time.
     pub(super) time: usize,
+    /// World from object.
     pub(super) pose: Pose,
 }
 

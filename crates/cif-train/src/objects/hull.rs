@@ -13,6 +13,7 @@ use crate::phases::Phases;
 
 /// Points of an object, in its frame.
 pub(super) struct Hull {
+    /// Metres.
     places: Vec<[f32; 3]>,
     /// In [0, 1], by point.
     colors: Vec<[f32; 3]>,

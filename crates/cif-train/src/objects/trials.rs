@@ -122,6 +122,7 @@ struct Contest<'a> {
     paths: Paths<'a>,
     /// Views that show it well.
     reliable: Vec<usize>,
+    /// The same, as trials are fitted to them and judged by them.
     views: SplitViews,
     /// Times of which no view is fitted to, so that their poses lie between those of others.
     between: Vec<usize>,
@@ -141,7 +142,9 @@ struct Simple {
 
 /// A motion that is kept.
 struct Chosen {
+    /// Way of moving.
     way: Way,
+    /// Evidence of its turns.
     rotation: RotationEvidence,
     /// Way whose fit it is made from.
     fitted: Way,

@@ -71,6 +71,7 @@ struct Moments {
 /// An object whose poses are known.
 #[derive(Clone, Copy)]
 pub(super) struct PosedObject<'a> {
+    /// In the order of times.
     pub(super) views: &'a [ObjectView],
     /// World from object, by time.
     pub(super) base: &'a BTreeMap<usize, Pose>,

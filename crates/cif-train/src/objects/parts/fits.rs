@@ -21,6 +21,7 @@ pub(super) struct Budget {
     pub(super) base: usize,
     /// Gaussians of the part.
     pub(super) part: usize,
+    /// Steps of both together, with the joint.
     pub(super) steps: usize,
 }
 

@@ -35,6 +35,7 @@ const PROMISE: f64 = 0.99;
 
 /// A guess whose values were searched for.
 pub(super) struct TriedGuess {
+    /// The joint, and the values that were tried.
     pub(super) guess: Guess,
     /// Value by time, radians or metres.
     pub(super) values: BTreeMap<usize, f64>,

@@ -28,6 +28,7 @@ pub(super) struct Search<'a> {
     pub(super) object: Object<'a>,
     /// World from object, by time.
     pub(super) base: &'a BTreeMap<usize, Pose>,
+    /// Views that show the object well.
     pub(super) views: SplitViews,
     pub(super) size: f64,
     /// Direction away from the support, in the frame of the object, where there is one.
