@@ -290,10 +290,8 @@ impl Moment<'_> {
     /// stage, and of the fine stage where that is to come.
     pub(crate) fn additions_left(&self) -> u32 {
         let densify = &self.config.densify;
-        let full_at = |stage: Stage| {
-            let steps = self.facts.stages.iterations(self.config, stage).min(densify.until);
-            (f64::from(densify.full_at) * f64::from(steps)) as u32
-        };
+        let full_at =
+            |stage: Stage| densify.full_after(self.facts.stages.iterations(self.config, stage)) as u32;
         let between = |from: u32, to: u32| (to / densify.every).saturating_sub(from / densify.every);
         let left = between(self.iteration, full_at(self.stage)) + 1;
         match self.stage {

@@ -443,6 +443,13 @@ pub struct ReportConfig {
     pub checkpoint_seconds: u32,
 }
 
+impl DensifyConfig {
+    /// Steps of a stage, of so many, after which the set is full, where Gaussians are added by `error`.
+    pub(crate) fn full_after(&self, steps: u32) -> f64 {
+        f64::from(self.full_at) * f64::from(self.until.min(steps))
+    }
+}
+
 impl TrainConfig {
     /// Steps of the fine stage.
     #[must_use]

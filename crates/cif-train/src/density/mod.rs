@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `strategy` | the trait of densification rules, and a change as they yield it |
 //! | `error_guided` | split by the errors of views, within a set of fixed size |
+//! | `growth` | how the set grows until it is full |
 //! | `contributions` | what it looks at: blending weights of every Gaussian, and errors by them |
 //! | `adaptive` | the rules of 3DGS: clone, split, prune, reset opacities |
 //! | `statistics` | what steps count for them |
@@ -13,6 +14,7 @@
 pub mod adaptive;
 mod contributions;
 pub mod error_guided;
+pub(crate) mod growth;
 mod rearrangement;
 pub mod relocate;
 mod statistics;

@@ -5,6 +5,7 @@ use cif_dataset::{Dataset, Split};
 use super::Calibration;
 use crate::budget::{COARSE, IDENTITY_STEPS_PER_FRAME, INSTANCE, PIXELS_OF_FIT, TRAVELS};
 use crate::config::{DensifyRule, TrainConfig};
+use crate::density::growth;
 use crate::detail::MOST;
 use crate::error::TrainError;
 use crate::trainer::{deformation_shape, memory_of_gaussians, memory_of_planes};
@@ -158,15 +159,11 @@ fn full_set(config: &TrainConfig, calibration: &Calibration) -> u32 {
     }
 }
 
-/// Mean of the Gaussians of the fine stage, which grow by equal factors until their set is full.
+/// Mean of the Gaussians of the fine stage.
 fn mean_gaussians(config: &TrainConfig, initial: f64, most: f64) -> f64 {
-    let densify = &config.densify;
     let fine = config.fine_iterations().max(1);
-    let growing = f64::from(densify.full_at) * f64::from(densify.until.min(fine)) / f64::from(fine);
-    let first = (initial / most.max(1.0)).clamp(1e-6, 1.0);
-    // Mean of a geometric growth from `first` to 1.
-    let grown = if first < 1.0 { (1.0 - first) / -first.ln() } else { 1.0 };
-    most * (1.0 - growing * (1.0 - grown))
+    let growing = config.densify.full_after(fine) / f64::from(fine);
+    growing * growth::mean(initial, most) + (1.0 - growing) * most
 }
 
 /// Views that additions of Gaussians look at, in all.

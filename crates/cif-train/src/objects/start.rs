@@ -52,7 +52,7 @@ const RIVALS: [i32; 6] = [-180, -120, -60, 60, 120, 180];
 pub(crate) struct Fitted {
     /// World from object, by time.
     pub(crate) poses: BTreeMap<usize, (DQuat, DVec3)>,
-    /// How far training may move each of these poses: 1 where its time shows nothing that the fit explains.
+    /// How far training may move each of these poses: 1 where its time shows all of it, which the fit does not explain.
     pub(crate) shares: BTreeMap<usize, f64>,
     /// In the frame of the object.
     #[serde(skip)]
@@ -233,8 +233,7 @@ impl<'a> Object<'a> {
     }
 }
 
-/// Share of the way that training may move poses, of each time: little where an object is seen whole and explained as well
-/// as usually, all where it is not seen, or something else than at other times.
+/// Shares of the way that training may move poses, by time.
 fn shares(fit: &mut Fit<'_>) -> BTreeMap<usize, f64> {
     let mut seen: BTreeMap<usize, (f64, f64)> = BTreeMap::new();
     for view in 0..fit.views.len() {
@@ -244,12 +243,16 @@ fn shares(fit: &mut Fit<'_>) -> BTreeMap<usize, f64> {
         (*most, *worst) = (most.max(visible), worst.max(loss));
     }
     let usual = median(&mut seen.values().map(|(_, loss)| *loss).collect::<Vec<_>>());
-    let share = |time: &usize| {
-        let explained =
-            seen.get(time).map_or(0.0, |(visible, loss)| visible * (usual / loss).min(1.0).powi(2));
-        1.0 - (1.0 - LEAST_SHARE) * explained
-    };
-    fit.poses.keys().map(|time| (*time, share(time))).collect()
+    let of =
+        |time: &usize| seen.get(time).map_or(LEAST_SHARE, |(visible, loss)| share(*visible, loss / usual));
+    fit.poses.keys().map(|time| (*time, of(time))).collect()
+}
+
+/// Share of the way that training may move a pose at whose time a share of the object is visible, by its loss over the usual
+/// one: the less is seen the less, as slivers lead the pose astray, and with it those at times that do not show the object,
+/// which follow; and little where it is explained as well as usually.
+fn share(visible: f64, loss: f64) -> f64 {
+    visible * (1.0 - (1.0 - LEAST_SHARE) * loss.max(1.0).powi(-2))
 }
 
 /// Turns an object as it rolls without slip along its path, about its middle.
@@ -265,5 +268,19 @@ fn roll_along(fit: &mut Fit<'_>, plane: &Plane, radius: f64) {
     let rotations = rolled(&places, plane.normal, radius);
     for ((pose, rotation), translation) in fit.poses.values_mut().zip(rotations).zip(places) {
         *pose = Pose { rotation, translation };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn training_moves_poses_that_are_seen_and_not_explained() {
+        assert!((share(1.0, 1.0) - LEAST_SHARE).abs() < 1e-12);
+        assert!((share(1.0, 0.5) - LEAST_SHARE).abs() < 1e-12, "better than usual");
+        assert!(share(1.0, 4.0) > 0.9);
+        // A sliver at the border of the image, explained or not.
+        assert!(share(0.1, 4.0) < LEAST_SHARE && share(0.1, 1.0) < 0.02);
     }
 }

@@ -7,6 +7,7 @@ use super::Trainer;
 use super::cost::Load;
 use crate::budget::{IDENTITY_STEPS_PER_FRAME, INSTANCE, MOVING, PIXELS_OF_FIT, TRAVELS};
 use crate::config::DensifyRule;
+use crate::density::growth;
 use crate::phase::Phase;
 use crate::schedule::{Due, may_halve};
 use crate::stage::Stage;
@@ -126,7 +127,7 @@ impl Trainer {
         let now = self.state.field.gaussians.len() as f64;
         let most = f64::from(config.densify.max_gaussians);
         let fine = self.stages.iterations(config, Stage::Fine);
-        let full = f64::from(config.densify.full_at) * f64::from(fine.min(config.densify.until));
+        let full = config.densify.full_after(fine);
         let grows = config.densify.rule == DensifyRule::Error && most > now;
         // What the coarse stage adds is little.
         if !grows || progress.stage > Stage::Fine || stage == Stage::Coarse || full < 1.0 {
@@ -137,7 +138,7 @@ impl Trainer {
             Stage::Fine if done < full => ((f64::from(step) - done) / (full - done)).clamp(0.0, 1.0),
             _ => 1.0,
         };
-        now * (most / now.max(1.0)).powf(way)
+        growth::grown(now, most, way)
     }
 
     /// Estimated seconds of the fits to come, by those of objects that were tried before, or by the steps of the coarse
