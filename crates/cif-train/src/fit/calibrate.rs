@@ -41,8 +41,7 @@ pub struct Calibration {
 }
 
 impl Calibration {
-    /// Expected seconds per step with so many Gaussians, images reduced by `reduction` more. Where there are more they
-    /// are smaller, so that rasterising grows with pixels alone.
+    /// Expected seconds per step with so many Gaussians, images reduced by `reduction` more.
     #[must_use]
     pub fn step_s(&self, gaussians: f64, reduction: u32) -> f64 {
         self.step_with(gaussians, self.moving, reduction)

@@ -215,7 +215,7 @@ fn memory(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::times::StepShares;
+    use crate::times::{StepShares, raster_cost};
     use crate::trainer::guard_tests::support::{Scene, capture};
 
     /// 10 ms per step with a full set of 10 000, half of it for pixels, a tenth for what moves.
@@ -268,7 +268,7 @@ mod tests {
         assert!((identity / (40.0 * IDENTITY_STEPS_PER_FRAME * 0.01) - 1.0).abs() < 1e-6, "{identity}");
         config.stages.coarse = 100;
         let coarse = steps_s(&config, &MEASURED, still, 1) - seconds - known;
-        let step = COARSE * 0.01 * (0.6 + 0.4 * 0.2);
+        let step = COARSE * 0.01 * (0.5 * raster_cost(1.0, 0.2) + 0.1 + 0.4 * 0.2);
         assert!((coarse / (100.0 * step) - 1.0).abs() < 1e-6, "{coarse}");
     }
 

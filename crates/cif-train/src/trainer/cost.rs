@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use crate::budget::COARSE;
-use crate::times::StepTimes;
+use crate::times::{StepTimes, raster_cost};
 use crate::working_size::PIXEL_SHARE;
 
 /// Share of the time of all steps so far whose steps are looked at, and limits of that time, seconds: single reports hold
@@ -12,7 +12,7 @@ const RECENT: f64 = 1.0 / 3.0;
 const SHORTEST_S: f64 = 10.0;
 const LONGEST_S: f64 = 60.0;
 
-/// What steps work on.
+/// What a step works on.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Load {
     /// Pixels of their images, relative to those that are worked on.
@@ -23,6 +23,12 @@ pub(super) struct Load {
     pub moving: f64,
 }
 
+impl Load {
+    fn raster(&self) -> f64 {
+        raster_cost(self.pixels, self.gaussians)
+    }
+}
+
 /// The steps of a run so far, at a report.
 #[derive(Clone, Copy, Debug, Default)]
 struct Report {
@@ -30,9 +36,17 @@ struct Report {
     at_s: f64,
     /// Times of their parts.
     times: StepTimes,
-    /// Number of steps, and the sums of what they worked on.
+    work: Work,
+}
+
+/// Sums over steps.
+#[derive(Clone, Copy, Debug, Default)]
+struct Work {
     steps: f64,
-    load: Load,
+    /// Costs of rasterising, see [`raster_cost`].
+    raster: f64,
+    gaussians: f64,
+    moving: f64,
 }
 
 /// Reports of a run, the last ones of which tell what a step costs.
@@ -43,13 +57,15 @@ impl Reports {
     /// Adds `steps` that were done since the last report, each of which worked on `load`: `at_s` seconds and `times` of all
     /// steps of the run.
     pub(super) fn add(&mut self, at_s: f64, times: StepTimes, steps: u32, load: &Load) {
-        let (last, count) = (self.0.back().copied().unwrap_or_default(), f64::from(steps));
-        let load = Load {
-            pixels: last.load.pixels + count * load.pixels,
-            gaussians: last.load.gaussians + count * load.gaussians,
-            moving: last.load.moving + count * load.moving,
+        let (Work { steps: before, raster, gaussians, moving }, count) =
+            (self.0.back().map(|last| last.work).unwrap_or_default(), f64::from(steps));
+        let work = Work {
+            steps: before + count,
+            raster: raster + count * load.raster(),
+            gaussians: gaussians + count * load.gaussians,
+            moving: moving + count * load.moving,
         };
-        self.0.push_back(Report { at_s, times, steps: last.steps + count, load });
+        self.0.push_back(Report { at_s, times, work });
         let window_s = (RECENT * at_s).clamp(SHORTEST_S, LONGEST_S);
         while self.0.len() > 2 && at_s - self.0[1].at_s >= window_s {
             self.0.pop_front();
@@ -60,29 +76,29 @@ impl Reports {
     pub(super) fn rate(&self) -> f64 {
         let mut last = self.0.iter().rev();
         let (Some(last), Some(before)) = (last.next(), last.next()) else { return 0.0 };
-        (last.steps - before.steps) / (last.at_s - before.at_s).max(1e-9)
+        (last.work.steps - before.work.steps) / (last.at_s - before.at_s).max(1e-9)
     }
 
     /// The cost of a step; `None` before two reports.
     pub(super) fn cost(&self) -> Option<StepCost> {
         let (first, last) = (self.0.front()?, self.0.back()?);
-        let steps = last.steps - first.steps;
-        let load = Load {
-            pixels: last.load.pixels - first.load.pixels,
-            gaussians: last.load.gaussians - first.load.gaussians,
-            moving: last.load.moving - first.load.moving,
+        let work = Work {
+            steps: last.work.steps - first.work.steps,
+            raster: last.work.raster - first.work.raster,
+            gaussians: last.work.gaussians - first.work.gaussians,
+            moving: last.work.moving - first.work.moving,
         };
         let (now, then) = (last.times.seconds_by_growth(), first.times.seconds_by_growth());
         let parts = std::array::from_fn(|part| now[part] - then[part]);
-        (steps > 0.0).then(|| StepCost::of(steps, &load, last.at_s - first.at_s, parts))
+        (work.steps > 0.0).then(|| StepCost::of(&work, last.at_s - first.at_s, parts))
     }
 }
 
 /// Seconds of a fine step by what it works on.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct StepCost {
-    /// For the pixels of an image of the size that is worked on.
-    pixels_s: f64,
+    /// For each unit of rasterising.
+    raster_s: f64,
     /// For each Gaussian.
     gaussian_s: f64,
     /// For each Gaussian that moves; `None` where none did.
@@ -92,32 +108,31 @@ pub(super) struct StepCost {
 }
 
 impl StepCost {
-    /// By so many steps in all, which took `seconds`, with what passed between them; their parts by what they grow with
+    /// By steps that took `seconds`, with what passed between them; their parts by what they grow with
     /// ([`StepTimes::seconds_by_growth`]) are not timed on GPUs.
-    fn of(steps: f64, load: &Load, seconds: f64, [pixels, moving, fixed, total]: [f64; 4]) -> Self {
+    fn of(work: &Work, seconds: f64, [pixels, moving, fixed, total]: [f64; 4]) -> Self {
         let each = |seconds: f64, of: f64| if of > 0.0 { seconds / of } else { 0.0 };
         if total <= 0.0 || pixels <= 0.0 {
-            let pixels_s = each(seconds, PIXEL_SHARE * load.pixels + (1.0 - PIXEL_SHARE) * steps);
             return Self {
-                pixels_s: PIXEL_SHARE * pixels_s,
-                gaussian_s: (1.0 - PIXEL_SHARE) * pixels_s * each(steps, load.gaussians),
-                moving_s: (load.moving > 0.0).then_some(0.0),
+                raster_s: each(PIXEL_SHARE * seconds, work.raster),
+                gaussian_s: each((1.0 - PIXEL_SHARE) * seconds, work.gaussians),
+                moving_s: (work.moving > 0.0).then_some(0.0),
                 fixed_s: 0.0,
             };
         }
         let with_others = (seconds / total).max(1.0);
         let gaussians = (total - pixels - moving - fixed).max(0.0);
         Self {
-            pixels_s: with_others * each(pixels, load.pixels),
-            gaussian_s: with_others * each(gaussians, load.gaussians),
-            moving_s: (load.moving > 0.0).then(|| with_others * each(moving, load.moving)),
-            fixed_s: with_others * each(fixed, steps),
+            raster_s: with_others * each(pixels, work.raster),
+            gaussian_s: with_others * each(gaussians, work.gaussians),
+            moving_s: (work.moving > 0.0).then(|| with_others * each(moving, work.moving)),
+            fixed_s: with_others * each(fixed, work.steps),
         }
     }
 
     /// Seconds of a step.
     pub(super) fn step_s(&self, load: &Load) -> f64 {
-        let still = self.pixels_s * load.pixels + self.gaussian_s * load.gaussians + self.fixed_s;
+        let still = self.raster_s * load.raster() + self.gaussian_s * load.gaussians + self.fixed_s;
         match self.moving_s {
             Some(moving_s) => still + moving_s * load.moving,
             None if load.moving > 0.0 => still / COARSE,
@@ -138,23 +153,24 @@ mod tests {
 
     #[test]
     fn parts_of_steps_grow_with_what_they_work_on() {
-        let load = Load { pixels: 25.0, gaussians: 2e5, moving: 5e4 };
         // 100 steps: pixels, what moves, and whatever they work on; a tenth of the time passes between them.
-        let cost = StepCost::of(100.0, &load, 11.0, [5.0, 1.0, 2.0, 10.0]);
         let step = Load { pixels: 0.25, gaussians: 2e3, moving: 500.0 };
+        let work = Work { steps: 100.0, raster: 100.0 * step.raster(), gaussians: 2e5, moving: 5e4 };
+        let cost = StepCost::of(&work, 11.0, [5.0, 1.0, 2.0, 10.0]);
         assert!((cost.step_s(&step) - 0.11).abs() < 1e-12, "{cost:?}");
-        let larger = Load { pixels: 1.0, gaussians: 4e3, moving: 500.0 };
-        assert!((cost.step_s(&larger) - 1.1 * (0.2 + 0.01 + 0.02 + 0.04)).abs() < 1e-12, "{cost:?}");
+        let larger = Load { pixels: 1.0, gaussians: 8e3, moving: 500.0 };
+        let raster = 4.0_f64.powf(0.6) * 2.0;
+        let expected = 1.1 * (0.05 * raster + 0.01 + 0.02 + 4.0 * 0.02);
+        assert!((cost.step_s(&larger) - expected).abs() < 1e-12, "{cost:?}");
         // Before anything moved.
-        let coarse = StepCost::of(100.0, &Load { moving: 0.0, ..load }, 5.0, [4.0, 0.0, 0.0, 5.0]);
+        let coarse = StepCost::of(&Work { moving: 0.0, ..work }, 5.0, [4.0, 0.0, 0.0, 5.0]);
         assert!((coarse.step_s(&step) - 0.05 / COARSE).abs() < 1e-12, "{coarse:?}");
         assert!((coarse.step_s(&Load { moving: 0.0, ..step }) - 0.05).abs() < 1e-12);
         // On a GPU.
-        let cost = StepCost::of(100.0, &load, 1.0, [0.0, 0.0, 0.0, 10.0]);
+        let cost = StepCost::of(&work, 1.0, [0.0, 0.0, 0.0, 10.0]);
         assert!((cost.step_s(&step) - 0.01).abs() < 1e-12, "{cost:?}");
         let ratio = cost.step_s(&larger) / cost.step_s(&step);
-        let units = |pixels, gaussians| PIXEL_SHARE * pixels + (1.0 - PIXEL_SHARE) * gaussians;
-        assert!((ratio - units(1.0, 2.0) / units(0.25, 1.0)).abs() < 1e-12, "{ratio}");
+        assert!((ratio - PIXEL_SHARE * raster - (1.0 - PIXEL_SHARE) * 4.0).abs() < 1e-12, "{ratio}");
     }
 
     #[test]

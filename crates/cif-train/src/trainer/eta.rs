@@ -170,7 +170,7 @@ mod tests {
     use super::super::cost::Reports;
     use super::super::guard_tests::support::{Scene, capture, small_config};
     use super::*;
-    use crate::times::StepTimes;
+    use crate::times::{StepTimes, raster_cost};
     use crate::working_size::PIXEL_SHARE;
 
     #[test]
@@ -220,10 +220,7 @@ mod tests {
         let step = |pixels: f64| Load { pixels, gaussians: n, moving: n };
         trainer.reports.add(0.0, times, 0, &step(0.25));
         trainer.reports.add(10.0, times, 10, &step(0.25));
-        let cost = |pixels: f64| {
-            let units = |pixels: f64| PIXEL_SHARE * pixels + 1.0 - PIXEL_SHARE;
-            units(pixels) / units(0.25)
-        };
+        let cost = |pixels: f64| PIXEL_SHARE * raster_cost(4.0 * pixels, 1.0) + 1.0 - PIXEL_SHARE;
         let identity = IDENTITY_STEPS_PER_FRAME * trainer.frames_of_identities(Stage::Fine) as f64;
         let expected = 40.0 + (40.0 + INSTANCE * identity) * cost(1.0) + 20.0 * cost(4.0);
         let eta_s = trainer.eta_s(Stage::Fine);
@@ -233,7 +230,7 @@ mod tests {
         trainer.reports = Reports::default();
         trainer.reports.add(0.0, times, 0, &step(1.0));
         trainer.reports.add(20.0, times, 10, &step(1.0));
-        let expected = 2.0 * (20.0 * cost(4.0) / cost(1.0) + INSTANCE * identity);
+        let expected = 2.0 * (20.0 * cost(1.0) + INSTANCE * identity);
         let eta_s = trainer.eta_s(Stage::Fine);
         assert!((eta_s / expected - 1.0).abs() < 1e-6, "{eta_s} {expected}");
         // Reports take in what moves: all at first.
