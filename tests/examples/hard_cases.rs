@@ -24,17 +24,18 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut worst: BTreeMap<u32, [Cell; PATHS.len()]> = BTreeMap::new();
     for line in std::io::stdin().lock().lines() {
         let line = line?;
-        // Tests print side by side with others, so that a line may begin with something else.
-        let Some((_, told)) = line.split_once("hard case ") else { continue };
-        let cells: Vec<&str> = told.split(" | ").collect();
-        let [row, path, way, _, error, _] = cells[..] else { continue };
+        // Tests print along with others, so that a line may begin with something else.
+        let Some((_, case)) = line.split_once("hard case ") else { continue };
+        let cells: Vec<&str> = case.split(" | ").collect();
+        let [row, path, direction, _, error, _] = cells[..] else { continue };
         let path = PATHS.iter().position(|known| *known == path);
-        let way = ["alone", "forward", "backward"].iter().position(|known| *known == way);
-        let (Ok(row), Some(path), Some(way), Ok(error)) = (row.parse(), path, way, error.parse::<f64>())
+        let direction = ["alone", "forward", "backward"].iter().position(|known| *known == direction);
+        let (Ok(row), Some(path), Some(direction), Ok(error)) =
+            (row.parse(), path, direction, error.parse::<f64>())
         else {
             continue;
         };
-        let seen = &mut worst.entry(row).or_default()[path][way];
+        let seen = &mut worst.entry(row).or_default()[path][direction];
         *seen = Some(seen.map_or(error, |seen| seen.max(error)));
     }
     if worst.is_empty() {

@@ -144,7 +144,7 @@ impl<'a> Schedule<'a> {
         let job = key.1;
         let busy: u32 = self.running.values().map(|(threads, _)| threads).sum();
         let free = self.limits.threads.saturating_sub(busy).max(1);
-        // What is free is shared among those that may begin beside it.
+        // What is free is shared among those that may begin along with it.
         let others = self.ready.len().min(self.limits.jobs - self.running.len());
         let threads = self.batch.steps[self.batch.jobs[job].step].resources.threads;
         let threads = threads.unwrap_or((free / others.max(1) as u32).max(1)).min(self.limits.threads);

@@ -208,7 +208,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn stages_are_means_over_steps_beside_their_floors() {
+    fn stages_are_means_over_steps_listed_with_their_floors() {
         let ms = Duration::from_millis;
         let steps = [
             vec![("project", ms(2)), ("accumulate", ms(1)), ("accumulate", ms(2)), ("judge", ms(1))],

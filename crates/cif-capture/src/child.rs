@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_program_is_told_from_a_failing_one() {
+    fn a_missing_program_is_distinguished_from_a_failing_one() {
         assert!(
             run_attended(&mut Command::new("no-such-program-here"), b"", &|| false, |_| ())
                 .unwrap()

@@ -39,8 +39,8 @@ impl Masks {
     /// The file of labels: in the folder of masks, else next to it, as captures have it.
     #[must_use]
     pub fn labels(&self) -> Option<PathBuf> {
-        let beside = cif_output::folder_of(&self.folder);
-        [&self.folder, &beside].iter().map(|folder| folder.join("instances.json")).find(|file| file.is_file())
+        let parent = cif_output::folder_of(&self.folder);
+        [&self.folder, &parent].iter().map(|folder| folder.join("instances.json")).find(|file| file.is_file())
     }
 }
 

@@ -196,14 +196,14 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_shows_nothing_is_told() {
+    fn what_shows_nothing_is_detected() {
         let of = |value: u8| Impression::of(&vec![value; WIDTH * HEIGHT]);
         assert!(of(0).is_empty() && of(5).is_empty() && of(200).is_empty());
         assert!(!Impression::of(&board(50, 0)).is_empty());
     }
 
     #[test]
-    fn moving_objects_are_told_from_a_moving_camera() {
+    fn moving_objects_are_distinguished_from_a_moving_camera() {
         let still = Impression::of(&board(50, 0));
         let mut with_object = board(50, 0);
         for y in 60..160 {

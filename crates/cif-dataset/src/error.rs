@@ -1,4 +1,4 @@
-//! Errors of reading a capture, for the person at the keyboard: each message names the file and the way out.
+//! Errors of reading a capture, for the person at the keyboard: each message names the file and the fix.
 
 use std::io;
 use std::path::{Path, PathBuf};

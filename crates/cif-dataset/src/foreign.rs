@@ -14,12 +14,12 @@ use crate::{Error, camera_check};
 /// Points: position and colour.
 pub type ColoredPoints = Vec<([f64; 3], [u8; 3])>;
 
-/// The camera of an image, as a file tells it.
+/// The camera of an image, as a file gives it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NamedCamera {
     /// Path of the image, as the file has it.
     pub name: String,
-    /// Width and height that the pixels refer to, where the file tells.
+    /// Width and height that the pixels refer to, where the file gives them.
     pub size: Option<(u32, u32)>,
     /// Focal lengths, pixels.
     pub focal_px: [f64; 2],

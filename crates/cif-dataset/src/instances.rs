@@ -41,7 +41,7 @@ struct Entry {
     taxonomies: BTreeMap<String, String>,
 }
 
-/// A map of ids to names, `{"1": "red mug"}`, as generators of synthetic captures write it beside their masks.
+/// A map of ids to names, `{"1": "red mug"}`, as generators of synthetic captures write it next to their masks.
 const CLASS_MAPPING: &str = "class_mapping.json";
 
 /// Labels named by a file, ascending id.

@@ -11,7 +11,7 @@
 //! | COLMAP | `sparse/0`; of several models the largest | every eighth image |
 //!
 //! Masks are PNG files of instance ids, 0 for unlabelled, or EXR files with a [`cryptomatte`]; they lie in `masks`, in a
-//! folder of that name beside the images, or in `seg` (Dynamic 3D Gaussians). Labels come from `instances.json`, which
+//! folder of that name next to the images, or in `seg` (Dynamic 3D Gaussians). Labels come from `instances.json`, which
 //! may also lie in the mask folder and may name `taxonomies` per instance, from `class_mapping.json`
 //! (`{"1": "sphere_1"}`), or from the Cryptomatte. Points that a program drew at random count as none. [`masks::Import`] makes such a folder of what other tools write. A mask folder may hold
 //! `confidence/<frame>.png`: 8-bit grey, the probability that the id of a pixel is right in units of 1 / 255. Named groups of held-out frames

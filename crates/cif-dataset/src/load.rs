@@ -14,7 +14,7 @@ impl Dataset {
     ///
     /// The image is decoded and turned upright, its alpha composited on `background` (display-referred, 0 to 1), reduced to the
     /// size of the frame's camera by area averages, and freed of lens distortion and skew by bilinear
-    /// resampling. The mask goes the same way by nearest neighbour only, with its original ids.
+    /// resampling. The mask is treated alike by nearest neighbour only, with its original ids.
     ///
     /// # Errors
     /// When a file is missing, truncated, or a mask has another aspect than its image.
@@ -78,7 +78,7 @@ impl Dataset {
         self.frames[index].mask.as_deref().map(|path| self.resized_mask(index, path)).transpose()
     }
 
-    /// Loads the confidence of the mask of a frame, where it has one, the way the mask goes.
+    /// Loads the confidence of the mask of a frame, where it has one, resampled as the mask.
     ///
     /// # Errors
     /// When the file is missing, truncated, no 8-bit grey PNG, or has another aspect than its image.

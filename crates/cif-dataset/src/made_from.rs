@@ -21,7 +21,7 @@ use crate::{Dataset, Frame, PointSource};
 /// Bytes that are read at a time.
 const PIECE: usize = 1 << 18;
 
-/// Longest value that is told, characters.
+/// Longest value that is printed, characters.
 const LONGEST_VALUE: usize = 60;
 
 /// Inputs that a product was made from.
@@ -139,9 +139,9 @@ impl MadeFrom {
         format!("{:032x}", xxh3_128(&text))
     }
 
-    /// The inputs whose names are `wanted`, and no values.
-    pub(crate) fn only(&self, wanted: impl Fn(&str) -> bool) -> Self {
-        let inputs = self.inputs.iter().filter(|(name, _)| wanted(name));
+    /// The inputs whose names are `requested`, and no values.
+    pub(crate) fn only(&self, requested: impl Fn(&str) -> bool) -> Self {
+        let inputs = self.inputs.iter().filter(|(name, _)| requested(name));
         let inputs = inputs.map(|(name, stamp)| (name.clone(), stamp.clone())).collect();
         Self { inputs, values: Map::new() }
     }
@@ -197,12 +197,12 @@ fn compare(place: &str, before: &Value, now: &Value, found: &mut Vec<String>) {
             compare(&place, &at(old), &at(new), found);
         }
     } else if before != now {
-        let told = [before, now].map(|value| match value {
+        let shown = [before, now].map(|value| match value {
             Value::Null => "nothing".to_owned(),
             value => value.to_string(),
         });
-        found.push(match told.iter().all(|told| told.chars().count() <= LONGEST_VALUE) {
-            true => format!("{place} was {} and is {}", told[0], told[1]),
+        found.push(match shown.iter().all(|value| value.chars().count() <= LONGEST_VALUE) {
+            true => format!("{place} was {} and is {}", shown[0], shown[1]),
             false => format!("{place} has changed"),
         });
     }
@@ -282,8 +282,8 @@ mod tests {
         assert_eq!(before.digest(), now(0, None).digest());
         assert_ne!(before.digest(), now(1, None).digest());
         std::fs::rename(folder.path().join("2.png"), folder.path().join("3.png")).unwrap();
-        let told = before.difference(&now(0, None)).unwrap();
-        assert_eq!(told, "keyframe 2.png is gone, and keyframe 3.png is new");
+        let message = before.difference(&now(0, None)).unwrap();
+        assert_eq!(message, "keyframe 2.png is gone, and keyframe 3.png is new");
     }
 
     #[test]

@@ -112,7 +112,7 @@ pub(crate) struct MaskListing {
 /// Finds the masks of a folder.
 ///
 /// Looked for, in this order: `<camera>/<folder>/<stem>.png` (Neu3D), `<folder>/<frame>.png`,
-/// `<folder>/<frame>.<image extension>.png`, where stems are unique `<folder>/<stem>.png`, and the folder beside the
+/// `<folder>/<frame>.<image extension>.png`, where stems are unique `<folder>/<stem>.png`, and the folder next to the
 /// image (`train/<folder>/<stem>.png`); each also with `.exr`. Files that are numbered as the frames of the video that the
 /// capture was made of, one for each, are those of its frames. Where none fits, EXR files that are bare numbers count
 /// the frames from 0, as renderers number them, and masks of an LLFF sequence belong to the images of their numbers
@@ -139,8 +139,8 @@ pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Mas
             if occurrences[stem.as_str()] == 1 {
                 candidates.push(base.join(stem));
             }
-            if let (true, Some(beside)) = (folder.is_relative(), frame.image.parent()) {
-                candidates.push(beside.join(folder).join(stem));
+            if let (true, Some(parent)) = (folder.is_relative(), frame.image.parent()) {
+                candidates.push(parent.join(folder).join(stem));
             }
             candidates.iter().find_map(|candidate| {
                 EXTENSIONS.iter().find_map(|extension| {
@@ -162,8 +162,8 @@ pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Mas
     let (folder_of_masks, place) = if base.is_dir() {
         (Some(base.clone()), base.display().to_string())
     } else {
-        let beside = format!("{}: {}/ beside the images", root.display(), folder.display());
-        (folder_of_training(frames, &paths), beside)
+        let next_to_images = format!("{}: {}/ beside the images", root.display(), folder.display());
+        (folder_of_training(frames, &paths), next_to_images)
     };
     folders.insert(base);
     let confidences = |folder: &Path| folder.join(CONFIDENCE_FOLDER);

@@ -50,8 +50,8 @@ pub fn meant<'a>(asked: &str, known: impl IntoIterator<Item = &'a str>) -> Optio
     if asked.contains(['*', '?']) {
         return None;
     }
-    let wanted = words(asked);
-    let far = known.into_iter().filter_map(|name| Some((distance(&wanted, name)?, name)));
+    let asked_words = words(asked);
+    let far = known.into_iter().filter_map(|name| Some((distance(&asked_words, name)?, name)));
     // Of equal ones that which is spelled most alike.
     far.min_by_key(|(far, name)| (*far, damerau_levenshtein(asked, name))).map(|(_, name)| name)
 }

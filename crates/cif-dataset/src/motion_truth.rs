@@ -1,4 +1,4 @@
-//! Known motion of a capture, where it has some: `motion.json`, and `tracks.npz` beside it.
+//! Known motion of a capture, where it has some: `motion.json`, and `tracks.npz` next to it.
 //!
 //! | file | holds |
 //! |---|---|

@@ -155,7 +155,7 @@ impl Dataset {
         Ok(listing.paths)
     }
 
-    /// Tells which way images lie whose EXIF turns them.
+    /// Notes the orientation of images whose EXIF turns them.
     fn note_turned_images(&mut self) {
         let root = self.root.display().to_string();
         let of = |is: &dyn Fn(&Turn) -> bool| self.frames.iter().filter(|frame| is(&frame.turn)).count();
@@ -335,7 +335,7 @@ impl Dataset {
         Ok(())
     }
 
-    /// Tells that training frames, or else held-out ones, have no mask.
+    /// Reports that training frames, or else held-out ones, have no mask.
     fn note_frames_without_mask(&mut self, place: &str) {
         let masked_of = |split: Split| {
             let frames = self.split_frames(split);
@@ -353,7 +353,7 @@ impl Dataset {
         }
     }
 
-    /// Tells which masks belong to which frames by their numbers.
+    /// Notes which masks belong to which frames by their numbers.
     fn note_numbered_masks(&mut self, place: &str) {
         let numbered: Vec<String> = self
             .frames
@@ -514,12 +514,12 @@ fn frames(
         return Err(Error::invalid(root, "no frame is left to train on; add frames to the training list"));
     }
     // `stored_reduction` divides what is asked for, unless the capture has no such images.
-    let wanted = options.downscale.unwrap_or(draft.stored_reduction);
-    let reduction = if wanted.is_multiple_of(draft.stored_reduction) {
-        wanted / draft.stored_reduction
+    let requested = options.downscale.unwrap_or(draft.stored_reduction);
+    let reduction = if requested.is_multiple_of(draft.stored_reduction) {
+        requested / draft.stored_reduction
     } else {
         warnings.push(format!(
-            "{}: images are stored reduced by {}, so a reduction by {wanted} is not to be had; they are read as they \
+            "{}: images are stored reduced by {}, so a reduction by {requested} is not to be had; they are read as they \
              are",
             root.display(),
             draft.stored_reduction

@@ -13,7 +13,7 @@ use crate::sizes::same_aspect;
 pub struct Turn {
     /// Of its image.
     pub image: Orientation,
-    /// Of files beside the image, such as masks, which have its width as their height.
+    /// Of files next to the image, such as masks, which have its width as their height.
     pub beside: Orientation,
 }
 
@@ -21,13 +21,13 @@ impl Turn {
     /// Pixels are taken as they are stored.
     pub const NONE: Self = Self { image: Orientation::NoTransforms, beside: Orientation::NoTransforms };
 
-    /// The image is turned as its EXIF says, files beside it where they lie as the image is stored.
+    /// The image is turned as its EXIF says, files next to it where they lie as the image is stored.
     #[must_use]
     pub fn upright(exif: Orientation) -> Self {
         Self { image: exif, beside: exif }
     }
 
-    /// The image stays as it is stored, files beside it are turned back where they were made upright.
+    /// The image stays as it is stored, files next to it are turned back where they were made upright.
     fn as_stored(exif: Orientation) -> Self {
         let back = match exif {
             Orientation::Rotate90 => Orientation::Rotate270,
@@ -38,8 +38,8 @@ impl Turn {
         Self { image: Orientation::NoTransforms, beside: back }
     }
 
-    /// The way of the camera of an image: upright where its width and height are nearer to those of the upright image.
-    /// Where they do not tell, such as for half turns, `of_stored` does.
+    /// The turn for the camera of an image: upright where its width and height are nearer to those of the upright image.
+    /// Where they do not determine it, such as for half turns, `of_stored` does.
     #[must_use]
     pub fn for_camera(exif: Orientation, stored: (u32, u32), camera: Option<DVec2>, of_stored: bool) -> Self {
         let aspect = |(width, height): (u32, u32)| (f64::from(width) / f64::from(height)).ln();
@@ -54,14 +54,14 @@ impl Turn {
         }
     }
 
-    /// Width and height of a file beside an image of `frame` pixels, once it lies as that.
+    /// Width and height of a file next to an image of `frame` pixels, once it lies as that.
     pub(crate) fn seen_size(&self, size: (u32, u32), frame: (u32, u32)) -> (u32, u32) {
         let turned = turned_size(self.beside, size);
         if same_aspect(size, frame) || !same_aspect(turned, frame) { size } else { turned }
     }
 
-    /// The pixels of a file beside an image of `frame` pixels as they lie in that: turned where their aspect says that they
-    /// lie the other way.
+    /// The pixels of a file next to an image of `frame` pixels as they lie in that: turned where their aspect says that
+    /// they lie the other way.
     pub(crate) fn seen<T: Copy>(&self, pixels: PixelGrid<T>, frame: (u32, u32)) -> PixelGrid<T> {
         let size = (pixels.width, pixels.height);
         if self.seen_size(size, frame) == size { pixels } else { turned(&pixels, self.beside) }

@@ -35,7 +35,7 @@ impl Layout {
 
 /// Recognises the layout of a folder.
 ///
-/// A COLMAP reconstruction beside another layout is what that layout was made from, and a file that marks a layout
+/// A COLMAP reconstruction next to another layout is what that layout was made from, and a file that marks a layout
 /// without the rest of it is left over: the other layout wins, with a note. Any other two are an error.
 ///
 /// # Errors
@@ -61,23 +61,23 @@ pub(crate) fn recognise(
         });
     }
     let mut fitting: Vec<Layout> = Layout::ALL.into_iter().filter(|layout| layout.fits(root)).collect();
-    let mut beside = Vec::new();
+    let mut others = Vec::new();
     if fitting.iter().any(|layout| layout.is_complete(root)) {
         let (complete, rest): (Vec<_>, Vec<_>) =
             fitting.into_iter().partition(|layout| layout.is_complete(root));
-        beside.extend(rest.iter().map(|layout| format!("of {layout} there is only {}", layout.marker())));
+        others.extend(rest.iter().map(|layout| format!("of {layout} there is only {}", layout.marker())));
         fitting = complete;
     }
     if fitting.len() > 1 && fitting.last() == Some(&Layout::Colmap) {
         fitting.pop();
-        beside.push("--layout colmap reads the COLMAP reconstruction beside it, without times".to_owned());
+        others.push("--layout colmap reads the COLMAP reconstruction beside it, without times".to_owned());
     }
-    if let (&[layout], false) = (&fitting[..], beside.is_empty()) {
+    if let (&[layout], false) = (&fitting[..], others.is_empty()) {
         notes.push(format!(
             "{}: read as {layout} ({}); {}",
             root.display(),
             layout.marker(),
-            beside.join("; ")
+            others.join("; ")
         ));
     }
     match fitting[..] {

@@ -62,7 +62,7 @@ fn an_image_without_camera_is_named() {
     let folder = hypernerf(3);
     fs::remove_file(folder.path().join("camera/000002.json")).unwrap();
     holds(&failure(&folder), &["000002.png", "camera/000002.json", "missing"]);
-    // Where the list is what counts, images beside it are only noted.
+    // Where the list is what counts, images next to it are only noted.
     let folder = nerfstudio(3);
     write_rgb(&folder.path().join("images/extra.png"), WIDTH, HEIGHT, shade(0));
     assert!(notes(&open(&folder), &["not used", "1 images", "no camera"]));

@@ -307,7 +307,7 @@ fn damaged_sequences_are_named() {
 }
 
 #[test]
-fn masks_beside_the_images_of_a_split_are_found_with_their_classes() {
+fn masks_next_to_the_images_of_a_split_are_found_with_their_classes() {
     let folder = dnerf(3, 2);
     for (split, count) in [("train", 4), ("test", 2)] {
         for k in 0..count {
@@ -329,7 +329,7 @@ fn masks_beside_the_images_of_a_split_are_found_with_their_classes() {
     // One line for all that is left over.
     assert_eq!(dataset.notes.len(), 1, "{:?}", dataset.notes);
     assert!(notes(&dataset, &["not used", "1 mask files"]), "{:?}", dataset.notes);
-    // Beside the masks and above them, the nearest goes first; instances.json goes before both of a folder.
+    // Next to the masks and above them, the nearest goes first; instances.json goes before both of a folder.
     write_json(&folder.path().join("train/class_mapping.json"), &json!({"1": "ball", "2": "box"}));
     assert_eq!(open(&folder).instances[0].label, "ball");
     write_json(&folder.path().join("train/instances.json"), &json!([{"id": 1, "label": "globe"}]));
@@ -376,7 +376,7 @@ fn cubes_that_a_program_drew_count_as_no_points() {
         assert_eq!(dataset.points.source, PointSource::Random, "{name}");
         assert!(notes(&dataset, &[name, "2000 points", "at random"]), "{:?}", dataset.notes);
     }
-    // Too few to tell them from measured ones.
+    // Too few to distinguish them from measured ones.
     let folder = dnerf(3, 1);
     write_cube(&folder.path().join("fused.ply"), 100);
     assert!(matches!(open(&folder).points.source, PointSource::File(_)));

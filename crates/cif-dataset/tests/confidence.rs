@@ -63,21 +63,21 @@ fn confidences_are_read_per_pixel_and_at_reduced_size() {
 #[test]
 fn confidences_that_do_not_fit_are_named_with_the_fix() {
     let (folder, path) = place();
-    let told = |words: &[&str]| {
+    let reports = |words: &[&str]| {
         let message = failure(&folder);
         let fix = ["masks/confidence/000001.png", "8-bit grey PNG of the size of the mask", "or remove it"];
         holds(&message, &[&fix, words].concat());
     };
     write_grey(&path, HEIGHT, WIDTH, |_, _| 255);
-    told(&["24 x 32", "32 x 24", "another aspect"]);
+    reports(&["24 x 32", "32 x 24", "another aspect"]);
     write_wide_mask(&path, WIDTH, HEIGHT, |_, _| 65_535);
-    told(&["not 8-bit grey"]);
+    reports(&["not 8-bit grey"]);
     write_mask(&path, WIDTH, HEIGHT, |_, _| 255);
-    told(&["not 8-bit grey"]);
+    reports(&["not 8-bit grey"]);
     write_rgb(&path, WIDTH, HEIGHT, shade(0));
-    told(&["not 8-bit grey"]);
+    reports(&["not 8-bit grey"]);
     write(&path, "no picture");
-    told(&["not a readable PNG"]);
+    reports(&["not a readable PNG"]);
 
     // What only decoding finds is found when the frame is loaded.
     write_grey(&path, WIDTH, HEIGHT, |x, y| (x * y * 37 % 251) as u8);

@@ -68,7 +68,7 @@ fn outlines_of_one_or_two_corners_cover_nothing() {
     let folder = hypernerf(3);
     let path = folder.path().join("coco.json");
     let stroke = json!([3, 4, 5, 6]);
-    // Beside a true outline, and alone.
+    // With a true outline, and alone.
     coco(&path, |v| {
         v["annotations"][0]["segmentation"].as_array_mut().unwrap().insert(0, stroke.clone());
         v["annotations"][2]["segmentation"] = json!([stroke, [1.5, 2]]);

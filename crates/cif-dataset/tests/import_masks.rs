@@ -123,7 +123,7 @@ fn arrays_of_truth_values_show_one_object() {
 }
 
 #[test]
-fn classes_of_grounded_sam_2_lie_beside_its_arrays() {
+fn classes_of_grounded_sam_2_lie_next_to_its_arrays() {
     let folder = hypernerf(2);
     let source = folder.path().join("tracked");
     for frame in 0..2 {
@@ -133,8 +133,8 @@ fn classes_of_grounded_sam_2_lie_beside_its_arrays() {
         let class =
             |id: u16, name: &str| json!({"instance_id": id, "class_name": name, "x1": 0, "logit": 0.0});
         let labels = json!({"1": class(1, "cup"), "2": class(2, "")});
-        let told = json!({"mask_name": format!("mask_{frame:06}.npy"), "labels": labels});
-        write_json(&source.join(format!("json_data/mask_{frame:06}.json")), &told);
+        let listing = json!({"mask_name": format!("mask_{frame:06}.npy"), "labels": labels});
+        write_json(&source.join(format!("json_data/mask_{frame:06}.json")), &listing);
     }
     let (kind, labels, frames) = imported(&folder, &source);
     assert_eq!((kind, labels), (SourceKind::Arrays, vec!["cup".to_owned(), "instance_2".to_owned()]));
@@ -314,7 +314,7 @@ fn mattes_are_channels_or_files_and_cut_at_a_half() {
 }
 
 #[test]
-fn sizes_and_frames_that_do_not_fit_are_told() {
+fn sizes_and_frames_that_do_not_fit_are_reported() {
     let folder = hypernerf(3);
     let source = folder.path().join("tracked");
     write_mask(&source.join("000001.png"), WIDTH, 2 * HEIGHT, |_, _| 1);

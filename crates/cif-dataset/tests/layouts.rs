@@ -200,7 +200,7 @@ fn frame_numbers_may_outgrow_their_zeros() {
 }
 
 #[test]
-fn neu3d_masks_may_lie_beside_the_cameras_and_a_step_may_be_missing() {
+fn neu3d_masks_may_lie_next_to_the_cameras_and_a_step_may_be_missing() {
     let folder = neu3d(2, 4);
     std::fs::remove_file(folder.path().join("cam01/images/0001.png")).unwrap();
     for step in 0..4 {
@@ -297,10 +297,10 @@ fn nerfstudio_frames_override_intrinsics_and_may_have_times_masks_and_points() {
 }
 
 #[test]
-fn nerfstudio_captures_may_tell_that_they_know_neither_metre_nor_up() {
+fn nerfstudio_captures_may_state_that_they_know_neither_metre_nor_up() {
     let folder = nerfstudio(3);
-    assert!(!warns(&open(&folder), &["guesses"]), "files that do not tell are taken at their word");
-    for (metres, up, told) in [
+    assert!(!warns(&open(&folder), &["guesses"]), "files that do not state it are taken at their word");
+    for (metres, up, warning) in [
         (false, false, &["neither", "masses"][..]),
         (false, true, &["metre", "masses"]),
         (true, false, &["up", "gravity"]),
@@ -308,7 +308,7 @@ fn nerfstudio_captures_may_tell_that_they_know_neither_metre_nor_up() {
         edit_json(&folder.path().join("transforms.json"), |value| {
             value["cif"] = json!({ "metres_known": metres, "up_known": up, "poses_from": "images" });
         });
-        assert!(warns(&open(&folder), told), "{told:?}");
+        assert!(warns(&open(&folder), warning), "{warning:?}");
     }
     edit_json(&folder.path().join("transforms.json"), |value| {
         value["cif"] = json!({ "metres_known": true, "up_known": true });
@@ -364,7 +364,7 @@ fn colmap_models_carry_their_distortion() {
 }
 
 #[test]
-fn a_reconstruction_beside_another_layout_only_warns() {
+fn a_reconstruction_next_to_another_layout_only_warns() {
     let folder = nerfstudio(3);
     write(&folder.path().join("sparse/0/cameras.txt"), "1 PINHOLE 32 24 40 40 16 12\n");
     let dataset = open(&folder);

@@ -1,4 +1,4 @@
-//! The way to a tracker and back, and what is printed of a capture.
+//! The path to a tracker and back, and what is printed of a capture.
 
 mod support;
 
@@ -231,8 +231,8 @@ fn feature_maps_are_read_at_the_size_of_images_and_belong_to_training_frames() {
     std::fs::remove_dir_all(&maps).unwrap();
     std::fs::create_dir(&maps).unwrap();
     let name = &dataset.frames[dataset.train_frames()[0]].name;
-    let told = cif_dataset::feature_maps(&dataset, &maps).unwrap_err().to_string();
-    holds(&told, &["maps", &format!("{name}.npy"), "has no feature map"]);
+    let message = cif_dataset::feature_maps(&dataset, &maps).unwrap_err().to_string();
+    holds(&message, &["maps", &format!("{name}.npy"), "has no feature map"]);
 }
 
 /// Masks of one id for the frames of `nerfstudio`.

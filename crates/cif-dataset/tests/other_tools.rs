@@ -299,7 +299,7 @@ fn marks_of_byte_order_are_no_text() {
 
 #[test]
 fn colours_of_points_are_taken_by_their_range() {
-    for (kind, row, color, told) in [
+    for (kind, row, color, note) in [
         ("float", "250 100 0", [250, 100, 0], "up to 255"),
         ("double", "1 0.2 0", [255, 51, 0], "up to 1"),
         ("ushort", "65535 257 0", [255, 1, 0], "up to 65535"),
@@ -316,7 +316,7 @@ fn colours_of_points_are_taken_by_their_range() {
         );
         let dataset = open(&folder);
         assert_eq!(dataset.points.colors[0], color, "{kind}");
-        assert_eq!(notes(&dataset, &["points3d.ply", told]), !told.is_empty(), "{kind}: {:?}", dataset.notes);
+        assert_eq!(notes(&dataset, &["points3d.ply", note]), !note.is_empty(), "{kind}: {:?}", dataset.notes);
     }
 }
 
@@ -372,9 +372,9 @@ fn frames_of_a_cvat_task_are_those_that_it_took() {
     assert_eq!(shown(Some(0)).unwrap(), "000005 000010", "what people say counts");
     for numbers in [[3, 10], [0, 100]] {
         write(&path, cvat(0, numbers));
-        let told = shown(None).unwrap_err().to_string();
+        let message = shown(None).unwrap_err().to_string();
         holds(
-            &told,
+            &message,
             &[
                 "annotations.xml",
                 "0 + 5 k",
@@ -404,7 +404,7 @@ fn frames_that_are_named_by_the_video_keep_their_numbers() {
 }
 
 #[test]
-fn a_reconstruction_beside_a_nerfies_capture_gives_its_points_in_the_world_of_its_cameras() {
+fn a_reconstruction_next_to_a_nerfies_capture_gives_its_points_in_the_world_of_its_cameras() {
     let folder = hypernerf(6);
     let root = folder.path();
     std::fs::remove_file(root.join("points.npy")).unwrap();
@@ -491,7 +491,7 @@ fn models_whose_images_lie_in_the_whole_capture_are_read() {
 }
 
 #[test]
-fn camera_models_that_came_later_are_told_with_the_way_out() {
+fn camera_models_that_came_later_are_reported_with_the_fix() {
     let folder = colmap_binary(4);
     let path = folder.path().join("sparse/0/cameras.bin");
     let mut bytes = std::fs::read(&path).unwrap();

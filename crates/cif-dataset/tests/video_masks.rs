@@ -124,8 +124,8 @@ fn numbers_that_could_be_several_things_are_refused_until_it_is_said() {
         let folder = capture(&["walk"]);
         let masks = folder.path().join("tracked");
         track(&masks, digits, 0, numbers.clone());
-        let told = failure_of(&folder, &masks);
-        holds(&told, &["walk.mp4", "10 frames", "--first-number"]);
+        let message = failure_of(&folder, &masks);
+        holds(&message, &["walk.mp4", "10 frames", "--first-number"]);
         let (ids, _) = imported(&folder, &masks, Some(0));
         let known = TAKEN.map(|number| numbers.contains(&number).then_some([number as u16 + 10, 0]));
         assert_eq!(ids, known, "{numbers:?}");

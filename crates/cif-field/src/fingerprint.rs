@@ -11,7 +11,7 @@ impl Field {
     /// A fingerprint of what a scene is made from: Gaussians, learned and recorded motion, identities, the
     /// instance table, times, and colour settings. Equal on every machine; cameras and record do not count.
     ///
-    /// 32 hexadecimal digits (XXH3, 128 bits). It tells apart files that were mixed up, not files that were
+    /// 32 hexadecimal digits (XXH3, 128 bits). It distinguishes files that were mixed up, not files that were
     /// forged.
     #[must_use]
     pub fn fingerprint(&self) -> String {

@@ -94,11 +94,11 @@ macro_rules! gaussian_parameters {
                 Self::zeros_of(rows, |_| true)
             }
 
-            /// Zeros of the parameters that are `wanted`; the arrays of the others are empty.
+            /// Zeros of the parameters that are `needed`; the arrays of the others are empty.
             #[must_use]
-            pub fn zeros_of(rows: usize, wanted: impl Fn(&Parameter) -> bool) -> Self {
+            pub fn zeros_of(rows: usize, needed: impl Fn(&Parameter) -> bool) -> Self {
                 // Fresh memory is zero already: nothing is written.
-                Self { $($field: bytemuck::zeroed_vec(if wanted(&$parameter) { rows } else { 0 }),)* }
+                Self { $($field: bytemuck::zeroed_vec(if needed(&$parameter) { rows } else { 0 }),)* }
             }
 
             /// Every parameter with its values.

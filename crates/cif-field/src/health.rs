@@ -6,7 +6,7 @@
 //!
 //! Repairs follow one rule: what is drawn stays as it was drawn. A Gaussian that is not drawn is removed, a clamped
 //! value takes the value it was clamped to. Only the deformation and the identities are shared by many Gaussians, so
-//! that a broken value there is replaced by the one it starts training with, which [`Repair`] tells.
+//! that a broken value there is replaced by the one it starts training with, which [`Repair`] reports.
 
 use std::collections::BTreeMap;
 
@@ -18,8 +18,8 @@ use crate::gaussians::{FLAT_LOG_SCALE, LOG_SCALE_RANGE};
 use crate::parameters::Activation;
 use crate::{Field, FieldError, Gaussians, Identities};
 
-/// Rows told per finding.
-const TOLD: usize = 5;
+/// Rows named per finding.
+const NAMED: usize = 5;
 
 /// Logit beyond which a sigmoid is 0 or 1 in single precision, and its gradient gone.
 const SATURATED: f32 = 17.0;
@@ -127,7 +127,7 @@ pub fn check(field: &Field, never_seen: Option<&[bool]>) -> Vec<Finding> {
     // Whatever else a load refuses.
     let mut rest = field.clone();
     if found.0.iter().any(|finding| finding.severity == Severity::Broken) {
-        let _told = repair(&mut rest).map_err(|error| {
+        let _done = repair(&mut rest).map_err(|error| {
             if let HealthError::Structure(error) = error {
                 found.structure(&Err(error));
             }
@@ -145,7 +145,7 @@ pub fn check(field: &Field, never_seen: Option<&[bool]>) -> Vec<Finding> {
 /// undefined state.
 pub fn repair(field: &mut Field) -> Result<Vec<Repair>, HealthError> {
     let mut done = Vec::new();
-    let mut tell = |count: usize, what: &str| {
+    let mut report = |count: usize, what: &str| {
         if count > 0 {
             done.push(Repair { what: what.to_owned(), count });
         }
@@ -159,19 +159,19 @@ pub fn repair(field: &mut Field) -> Result<Vec<Repair>, HealthError> {
     }
     if let Some(rows) = &mut field.identities {
         let mended = mend_identities(rows);
-        tell(mended, "entries of identities that were not finite take the value that training starts with");
+        report(mended, "entries of identities that were not finite take the value that training starts with");
         if rows.validate(n, field.instances.len()).is_err() {
             field.identities = None;
-            tell(
+            report(
                 1,
                 "the identity rows did not fit the Gaussians and were left out; cif train --from makes new ones",
             );
         }
     }
     let renamed = mend_names(field);
-    tell(renamed, "names with NUL characters go without them");
+    report(renamed, "names with NUL characters go without them");
     let clamped = clamp_scales(&mut field.gaussians);
-    tell(clamped, "log-scales outside -20 to 10 take the limit that the renderer clamps them to");
+    report(clamped, "log-scales outside -20 to 10 take the limit that the renderer clamps them to");
     let drawable: Vec<u32> =
         (0..n).filter(|row| is_drawable(&field.gaussians, *row)).map(|row| row as u32).collect();
     if drawable.is_empty() {
@@ -179,30 +179,30 @@ pub fn repair(field: &mut Field) -> Result<Vec<Repair>, HealthError> {
     }
     if drawable.len() < n {
         *field = field.gather(&drawable);
-        tell(n - drawable.len(), "Gaussians that cannot be drawn were removed");
+        report(n - drawable.len(), "Gaussians that cannot be drawn were removed");
     }
     if let Some(deformation) = &mut field.deformation {
         let planes = replace_bad(&mut deformation.planes, 1.0);
-        tell(planes, "features of the deformation that were not finite are 1, which changes nothing");
+        report(planes, "features of the deformation that were not finite are 1, which changes nothing");
         let mlp = replace_bad(&mut deformation.mlp, 0.0);
-        tell(mlp, "weights of the deformation that were not finite are 0; what moves may move differently");
+        report(mlp, "weights of the deformation that were not finite are 0; what moves may move differently");
         if matches!(deformation.validate(), Err(FieldError::Bounds { .. })) {
             let around =
                 Bounds::around(field.gaussians.means.iter().map(|mean| DVec3::from(mean.map(f64::from))));
             let margin = DVec3::splat(around.size().max_element().max(1e-3) * 1e-3);
             deformation.bounds = Bounds { low: around.low - margin, high: around.high + margin };
-            tell(1, "the box of the deformation is that of the Gaussians; what moves may move differently");
+            report(1, "the box of the deformation is that of the Gaussians; what moves may move differently");
         }
     }
     if !(field.extent.is_finite() && field.extent > 0.0) {
         field.extent = 1.0;
-        tell(1, "the extent was no length and is 1");
+        report(1, "the extent was no length and is 1");
     }
     field.validate()?;
     Ok(done)
 }
 
-/// Findings in the order they are told.
+/// Findings in the order they are reported.
 #[derive(Default)]
 struct Findings(Vec<Finding>);
 
@@ -219,7 +219,7 @@ impl Findings {
         let mut count = 0;
         for row in rows {
             count += 1;
-            if first.len() < TOLD {
+            if first.len() < NAMED {
                 first.push(row);
             }
         }
@@ -545,7 +545,7 @@ mod tests {
     }
 
     #[test]
-    fn copies_and_unseen_gaussians_are_told() {
+    fn copies_and_unseen_gaussians_are_reported() {
         let mut field = testing::field(10, 2);
         let sources = [0, 1, 1, 2, 1];
         field.tracks = None;
@@ -562,7 +562,7 @@ mod tests {
     }
 
     #[test]
-    fn identities_that_do_not_fit_are_left_out_and_told() {
+    fn identities_that_do_not_fit_are_left_out_and_reported() {
         let mut field = testing::field(10, 3);
         field.identities.as_mut().unwrap().row_offsets[4] = u32::MAX;
         assert!(found(&field).iter().any(|f| (f.0, f.1) == ("structure", "identities")));

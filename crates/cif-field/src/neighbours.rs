@@ -82,7 +82,7 @@ impl NearestNeighbours {
             let node_index = node.item as usize;
             let range = self.row_offsets[node_index] as usize..self.row_offsets[node_index + 1] as usize;
             let rows = self.rows[range].iter().filter(|&&row| Some(row) != without);
-            // A node's rows ascend, so its first `count` are the ones that can be wanted.
+            // A node's rows ascend, so its first `count` are the ones that can be needed.
             found.extend(rows.take(count).map(|&row| Neighbour { row, squared_distance: node.distance }));
         }
         found.sort_by(|a, b| a.squared_distance.total_cmp(&b.squared_distance).then(a.row.cmp(&b.row)));

@@ -320,7 +320,7 @@ fn take_frame(notes: &mut Map<String, Value>) -> Result<CaptureFrame, RecordErro
     Ok(CaptureFrame::default())
 }
 
-/// Until version 0.1 files told how to draw them by the settings of the run, and exposures beside its times.
+/// Until version 0.1 files stated how to draw them in the settings of the run, and exposures next to its times.
 fn drawing_of_older_files(settings: Option<&Value>, run: Option<&mut Run>) -> Drawing {
     let setting = |pointer: &str| settings.and_then(|settings| settings.pointer(pointer));
     let ablations = setting("/instance/ablate").and_then(Value::as_array);
@@ -477,8 +477,9 @@ mod tests {
             json!({ "offset": [0.0, 0.0, 0.0], "scale": 0.0 }),
             json!("far"),
         ] {
-            let told = Record::from_json(json!({ "dataset": { "frame": wrong } })).unwrap_err().to_string();
-            assert!(told.contains("train the scene again"), "{told}");
+            let message =
+                Record::from_json(json!({ "dataset": { "frame": wrong } })).unwrap_err().to_string();
+            assert!(message.contains("train the scene again"), "{message}");
         }
     }
 }

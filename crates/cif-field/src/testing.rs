@@ -97,7 +97,7 @@ pub(crate) fn field(n: usize, seed: u64) -> Field {
 pub(crate) fn tracked_field(n: usize, seed: u64) -> Field {
     let mut field = field(n, seed);
     let group_of: Vec<u32> = (0..n as u32).map(|row| if row % 4 == 3 { NO_GROUP } else { row % 4 }).collect();
-    let count = |wanted: u32| group_of.iter().filter(|group| **group == wanted).count();
+    let count = |of: u32| group_of.iter().filter(|group| **group == of).count();
     let (turning, members, added) = (count(0), count(1), count(2));
     let opacity = |k: usize| (k % 7) as f32 / 6.0;
     let color = |k: usize| std::array::from_fn(|c| (k as f32 - c as f32) / 16.0);

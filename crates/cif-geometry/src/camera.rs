@@ -61,7 +61,7 @@ impl PinholeCamera {
         self.camera_from_world.inverse().translation
     }
 
-    /// The camera on the way to another one: the shortest turn, a straight line of centres and intermediate
+    /// The camera on the path to another one: the shortest turn, a straight line of centres and intermediate
     /// intrinsics, `ratio` being 0 here and 1 there. Image sizes are those of this one.
     #[must_use]
     pub fn toward(&self, other: &Self, ratio: f64) -> Self {
@@ -185,14 +185,14 @@ mod tests {
         for (width, height) in [(1, 1), (1920, 1080), (65_536, 4096), (16_384, 16_384), (1, 65_536)] {
             assert_eq!(check_image_size(width, height), Ok(()), "{width} x {height}");
         }
-        for (width, height, told) in [
+        for (width, height, reason) in [
             (0, 48, "0 x 48 pixels has none"),
             (60_000, 60_000, "has 3600000000, more than the 268435456"),
             (65_537, 1, "a side of 65537, more than the 65536"),
             (u32::MAX, u32::MAX, "a side of 4294967295"),
         ] {
             let problem = check_image_size(width, height).unwrap_err();
-            assert!(problem.contains(told), "{problem}");
+            assert!(problem.contains(reason), "{problem}");
         }
     }
 

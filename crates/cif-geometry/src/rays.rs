@@ -8,7 +8,7 @@ use crate::stats::median;
 /// Determinant of the summed projections across rays below which [`meeting_point`] takes the rays as parallel.
 const PARALLEL: f64 = 1e-9;
 
-/// Fewest rays of which some may be told to miss the others.
+/// Fewest rays among which some may be found to miss the others.
 const FEWEST_RAYS: usize = 4;
 
 /// Most rays of which all pairs are tried.
@@ -140,7 +140,7 @@ mod tests {
         (offsets[2], offsets[4]) = (DVec3::new(0.2, 0.0, 0.1), DVec3::new(0.0, 0.1, -0.2));
         let off = |rays: &[(Ray, f64)]| (meeting_point(rays).unwrap() - POINT).length();
         assert!(off(&rays(&offsets)) < 1e-3);
-        // Three cannot tell which misses.
+        // Three do not show which misses.
         assert!(off(&rays(&offsets[..3])) > 0.03);
     }
 }

@@ -35,11 +35,11 @@ pub fn upper_median(values: &mut [f64]) -> Option<f64> {
 pub fn weighted_quantile(values: &[f64], weights: &[f64], quantile: f64) -> f64 {
     let mut order: Vec<u32> = (0..values.len() as u32).collect();
     order.sort_unstable_by(|&a, &b| values[a as usize].total_cmp(&values[b as usize]).then(a.cmp(&b)));
-    let wanted = quantile * weights.iter().sum::<f64>();
+    let target = quantile * weights.iter().sum::<f64>();
     let mut sum = 0.0;
     for index in order {
         sum += weights[index as usize];
-        if sum >= wanted && sum > 0.0 {
+        if sum >= target && sum > 0.0 {
             return values[index as usize];
         }
     }

@@ -179,12 +179,15 @@ fn assert_placed(before: &Splats, graph: &SceneGraph, time_code: f64, matrix: &D
     let world = node.world_transform(time_code);
     for k in 0..before.len() {
         let mean = |splats: &Splats| DVec3::from_array(splats.means[k].map(f64::from));
-        let (wanted, found) = (matrix.transform_point3(mean(before)), world.apply(mean(&node.splats)));
-        assert!((wanted - found).length() < 1e-5, "{wanted} {found}");
-        let wanted = matrix.matrix3 * covariance(before, k) * matrix.matrix3.transpose();
+        let (expected, found) = (matrix.transform_point3(mean(before)), world.apply(mean(&node.splats)));
+        assert!((expected - found).length() < 1e-5, "{expected} {found}");
+        let expected = matrix.matrix3 * covariance(before, k) * matrix.matrix3.transpose();
         let found = world.rotation * covariance(&node.splats, k) * world.rotation.transpose();
-        let size = wanted.to_cols_array().iter().fold(0.0_f64, |all, value| all.max(value.abs()));
-        assert!((wanted - found).to_cols_array().iter().all(|v| v.abs() < 1e-5 * size), "{wanted} {found}");
+        let size = expected.to_cols_array().iter().fold(0.0_f64, |all, value| all.max(value.abs()));
+        assert!(
+            (expected - found).to_cols_array().iter().all(|v| v.abs() < 1e-5 * size),
+            "{expected} {found}"
+        );
     }
 }
 

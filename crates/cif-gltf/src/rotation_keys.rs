@@ -1,7 +1,7 @@
 //! Rotation keys so close that viewers which draw straight lines between quaternions turn as the file says.
 //!
 //! glTF asks for slerp between LINEAR rotation keys; common viewers interpolate the four components and
-//! normalise. Both go the same way, but at different speeds: over a turn of angle a the two differ by at most
+//! normalise. Both follow the same arc, but at different speeds: over a turn of angle a the two differ by at most
 //! 2 max_t |atan2(t sin(a/2), 1 - t + t cos(a/2)) - t a/2| = sqrt(3) / 432 a^3 + O(a^5). Reduced tracks turn by up
 //! to half a turn between keys, where that is 8 degrees. So keys on the slerp are written between them, close
 //! enough for [`allowed_error`], and the sampler's `extras.cif.inserted` says which they are: reading drops
@@ -98,13 +98,13 @@ pub(crate) fn drop_inserted(times: &mut Vec<f32>, values: &mut Vec<DVec4>, inser
     while let Some(next) = (kept + 1..count).find(|&position| !marked[position]) {
         let (from, to) = (DQuat::from_vec4(values[kept]), DQuat::from_vec4(values[next]));
         let (start, end) = (f64::from(times[kept]), f64::from(times[next]));
-        let on_the_way = (kept + 1..next).all(|position| {
+        let on_the_arc = (kept + 1..next).all(|position| {
             let part = (f64::from(times[position]) - start) / (end - start);
             let slerp = DVec4::from(from.normalize().slerp(to.normalize(), part));
             let (plus, minus) = (slerp - values[position], slerp + values[position]);
             plus.length().min(minus.length()) <= MOVED
         });
-        if !on_the_way {
+        if !on_the_arc {
             dropped[kept + 1..next].fill(false);
         }
         kept = next;

@@ -123,9 +123,9 @@ mod tests {
     #[test]
     fn names_for_ffmpeg_are_those_of_files() {
         for name in ["-i.mp4", "clip:1.mp4", "a%03d.mp4"] {
-            let told = for_ffmpeg(name).unwrap().into_string().unwrap();
-            let path = told.strip_prefix("file:").unwrap();
-            assert!(Path::new(path).is_absolute() && path.ends_with(name), "{told}");
+            let given = for_ffmpeg(name).unwrap().into_string().unwrap();
+            let path = given.strip_prefix("file:").unwrap();
+            assert!(Path::new(path).is_absolute() && path.ends_with(name), "{given}");
         }
     }
 

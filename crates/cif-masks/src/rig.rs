@@ -70,12 +70,12 @@ fn seen(frame: &Frame, points: &[DVec3]) -> Vec<Option<DVec2>> {
 /// The mask of a view from views of the same moment whose masks are known. `points` are world positions, metres, at that
 /// moment.
 ///
-/// `None` where no point is seen both by a known view and by the wanted one.
+/// `None` where no point is seen both by a known view and by the requested one.
 ///
 /// # Panics
 /// When masks and images of known views differ in size.
 #[must_use]
-pub fn carry(known: &[(View<'_>, &Keyframe)], wanted: &View<'_>, points: &[DVec3]) -> Option<Keyframe> {
+pub fn carry(known: &[(View<'_>, &Keyframe)], requested: &View<'_>, points: &[DVec3]) -> Option<Keyframe> {
     let classes = Classes::new(known.iter().map(|(_, keyframe)| &keyframe.ids));
     let count = classes.ids.len();
     let mut votes = vec![0_u32; points.len() * count];
@@ -100,11 +100,11 @@ pub fn carry(known: &[(View<'_>, &Keyframe)], wanted: &View<'_>, points: &[DVec3
             sure(at).then(|| classes.class_of(ids.pixels[at]))
         }));
     }
-    let (full_width, full_height) = (wanted.image.width as usize, wanted.image.height as usize);
+    let (full_width, full_height) = (requested.image.width as usize, requested.image.height as usize);
     let (width, height) = size_to_follow(full_width, full_height);
     let mut seeds = vec![Plane::filled(width, height, 0.0); count];
     let mut any = false;
-    for (pixel, votes) in seen(wanted.frame, points).iter().zip(votes.chunks_exact(count)) {
+    for (pixel, votes) in seen(requested.frame, points).iter().zip(votes.chunks_exact(count)) {
         let total: u32 = votes.iter().sum();
         let (Some(pixel), true) = (pixel, total > 0) else { continue };
         let x = pixel.x as usize * width / full_width;
@@ -119,7 +119,7 @@ pub fn carry(known: &[(View<'_>, &Keyframe)], wanted: &View<'_>, points: &[DVec3
     }
     let sigma = (REACH * width.max(height) as f32).max(1.0);
     let spread: Vec<Plane> = seeds.iter().map(|plane| plane.blurred(sigma)).collect();
-    let features = Features::new(&Picture::new(wanted.image, width, height));
+    let features = Features::new(&Picture::new(requested.image, width, height));
     let looks = Forest::new(&samples, count).classify(&features);
     // The blurred value of a single seed a standard deviation away.
     let one = (-0.5_f32).exp() / (std::f32::consts::TAU * sigma * sigma);

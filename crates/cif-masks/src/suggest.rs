@@ -45,8 +45,8 @@ pub fn next_frame(cameras: &[Camera]) -> Option<usize> {
         let of_camera = |camera: &Camera| {
             let doubts: Vec<f64> =
                 camera.frames.iter().map(|frame| if counts(frame) { frame.doubt } else { 0.0 }).collect();
-            let places = |wanted: &dyn Fn(&Propagated) -> bool| -> Vec<usize> {
-                (0..camera.frames.len()).filter(|k| wanted(&camera.frames[*k])).collect()
+            let places = |filter: &dyn Fn(&Propagated) -> bool| -> Vec<usize> {
+                (0..camera.frames.len()).filter(|k| filter(&camera.frames[*k])).collect()
             };
             let (keyframes, candidates) = (places(&|frame| frame.painted), places(counts));
             next_keyframe(&doubts, &keyframes, &candidates).map(|(k, gain)| (camera.frames[k].frame, gain))

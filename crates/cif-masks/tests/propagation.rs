@@ -279,7 +279,7 @@ fn wall(x: f64) -> (Frame, PixelGrid<[u8; 3]>, PixelGrid<u16>) {
             .expect("the lens covers the image");
         let place = camera.centre() + DVec3::new(ideal.x, ideal.y, 1.0) * 2.0;
         let near = |cx: f64, cy: f64| (place.x - cx).abs().max((place.y - cy).abs()) < 0.25;
-        // Both squares look alike: only points can tell them apart.
+        // Both squares look alike: only points can distinguish them.
         let id = if near(-0.4, 0.1) { 5 } else { u16::from(near(0.4, -0.1)) * 8 };
         let shade = 0.6 + 0.8 * texture(1.5, 40.0 * place.x as f32, 40.0 * place.y as f32);
         let color = if id == 0 { [60.0, 90.0, 110.0] } else { [190.0, 80.0, 60.0] };

@@ -5,7 +5,7 @@
 //! | `name` | which names of frames may become paths, and the path of such a name in a folder |
 //! | `place` | where an output goes once links are followed |
 //! | `shared` | files and folders of our names in places that others may write into |
-//! | `unfinished` | temporary files beside their outputs, which never outlive their process for long |
+//! | `unfinished` | temporary files next to their outputs, which never outlive their process for long |
 //! | `workplace` | folders for temporary files, which do not either |
 //!
 //! Outputs are written to a temporary file in their own folder, which takes their name once it is on the disk.

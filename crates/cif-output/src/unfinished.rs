@@ -1,4 +1,4 @@
-//! Temporary files beside the outputs that they become.
+//! Temporary files next to the outputs that they become.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File, OpenOptions};
@@ -136,7 +136,7 @@ impl Unfinished {
         let mut builder = tempfile::Builder::new();
         let machine = of_this_machine();
         builder.prefix(PREFIX).suffix(&machine).rand_bytes(12);
-        // Temporary files are private by default; the result should have the usual permissions. Errors are those of the
+        // Temporary files are private by default; the result should have ordinary permissions. Errors are those of the
         // system, for the temporary name says nothing to anybody.
         let create = |path: &Path| OpenOptions::new().read(true).write(true).create_new(true).open(path);
         loop {
@@ -200,7 +200,7 @@ fn remove(path: &Path) {
     let _ = fs::remove_file(path);
 }
 
-/// A file being written beside the one that it becomes or replaces.
+/// A file being written next to the one that it becomes or replaces.
 pub struct NewFile {
     unfinished: Unfinished,
     target: PathBuf,
@@ -271,7 +271,7 @@ pub fn finish_all(files: impl IntoIterator<Item = NewFile>) -> io::Result<()> {
     Ok(())
 }
 
-/// Paths for a writer that opens its files itself, beside the output that they become.
+/// Paths for a writer that opens its files itself, next to the output that they become.
 pub struct Scratch(Unfinished);
 
 impl Scratch {
@@ -420,7 +420,7 @@ mod tests {
         let missing = at("missing");
         assert!(scratch.replace(&[(arrays, at("payloads")), (missing, at("out.usda"))], &[]).is_err());
         assert_eq!((read("payloads/a.usdc").as_str(), read("out.usda").as_str()), ("two", "two"));
-        // A file alone makes the folder beside it unneeded.
+        // A file alone makes the folder next to it unneeded.
         let (scratch, _, root) = write("four");
         scratch.replace(&[(root, at("out.usda"))], &[at("payloads")]).unwrap();
         assert_eq!((names(folder.path()), read("out.usda").as_str()), (vec!["out.usda".to_owned()], "four"));
@@ -521,10 +521,10 @@ mod tests {
             assert!(lines.any(|line| line.unwrap().contains("begun")));
             child
         };
-        let mut told = begin();
+        let mut abandoning = begin();
         assert_eq!(names(folder.path()).len(), 3);
-        told.stdin.take().unwrap().write_all(b"abandon\n").unwrap();
-        assert_eq!(told.wait().unwrap().code(), Some(130));
+        abandoning.stdin.take().unwrap().write_all(b"abandon\n").unwrap();
+        assert_eq!(abandoning.wait().unwrap().code(), Some(130));
         assert!(names(folder.path()).is_empty());
 
         let mut killed = begin();

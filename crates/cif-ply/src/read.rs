@@ -109,7 +109,7 @@ fn turned(comments: &[String]) -> Option<UpAxis> {
     ours.find_map(|comment| comment.trim().strip_prefix(TURNED)?.trim().parse().ok())
 }
 
-/// The axis that points up, where the comment of nerfstudio or Brush tells it (`Vertical Axis: z`).
+/// The axis that points up, where the comment of nerfstudio or Brush states it (`Vertical Axis: z`).
 fn vertical_axis(comments: &[String]) -> Option<UpAxis> {
     let mut others = comments.iter().filter(|_| !is_ours(comments));
     others

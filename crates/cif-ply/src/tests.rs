@@ -357,7 +357,7 @@ fn surveyed_coordinates_stay_exact_there_and_back() {
 }
 
 #[test]
-fn antialiased_splats_are_told_by_a_comment() {
+fn antialiased_splats_are_recognised_by_a_comment() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.ply");
     let whole = String::from_utf8(ascii(&splats(2, 0), &[])).unwrap();
@@ -459,7 +459,7 @@ fn names_of_cloudcompare_and_the_axis_of_nerfstudio_and_brush_are_understood() {
 }
 
 #[test]
-fn colours_in_place_of_coefficients_are_told_by_their_range() {
+fn colours_in_place_of_coefficients_are_recognised_by_their_range() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.ply");
     let names: Vec<&str> = PLAIN[..11].iter().copied().chain(["red", "green", "blue"]).collect();

@@ -30,8 +30,8 @@ pub(crate) fn trajectory<'py>(
     graph: &SceneGraph,
     label: String,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let wanted = ObjectQuery { label: Some(label.clone()), ..ObjectQuery::default() };
-    let found = cif_scene::trajectories(graph, &wanted, PLACE).map_err(cif_error)?;
+    let query = ObjectQuery { label: Some(label.clone()), ..ObjectQuery::default() };
+    let found = cif_scene::trajectories(graph, &query, PLACE).map_err(cif_error)?;
     let [path] = found.as_slice() else {
         let names: Vec<&str> = found.iter().map(|path| path.instance.as_str()).collect();
         let names = names.join(", ");

@@ -11,7 +11,7 @@ use crate::camera::Camera;
 use crate::error::cif_error;
 use crate::process;
 
-/// Renders a view with the wanted layers, those of instances where the field has identities.
+/// Renders a view with the requested layers, those of instances where the field has identities.
 pub(crate) fn render(
     py: Python<'_>,
     field: &Field,

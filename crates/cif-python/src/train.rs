@@ -171,8 +171,8 @@ impl Run {
                 trainer
             }
             None => {
-                let is_wanted = self.typed.alone(dataset.layout)?.model.triangulate;
-                let is_found = !is_wanted || cif::starting_points::find(&mut dataset, phases)?;
+                let is_requested = self.typed.alone(dataset.layout)?.model.triangulate;
+                let is_found = !is_requested || cif::starting_points::find(&mut dataset, phases)?;
                 let (mut config, plan) = self.typed.on(&dataset, phases)?;
                 config.downscale = downscale;
                 config.model.triangulate &= is_found;

@@ -88,8 +88,8 @@ impl RenderSettings {
     /// With the instance pass where the outputs need it and the field has identities, and only there.
     #[must_use]
     pub(crate) fn for_outputs(&self, field: &cif_field::Field, channels: Channels) -> Self {
-        let wanted = channels.instances && field.identities.is_some();
-        Self { instances: wanted.then(|| self.instances.unwrap_or_default()), ..*self }
+        let drawn = channels.instances && field.identities.is_some();
+        Self { instances: drawn.then(|| self.instances.unwrap_or_default()), ..*self }
     }
 
     /// The settings a field was trained with.

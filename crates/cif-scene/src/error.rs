@@ -44,7 +44,7 @@ pub enum SceneError {
         /// The problem.
         what: String,
     },
-    /// A file that does not tell which field it came from.
+    /// A file that does not say which field it came from.
     #[error(
         "{file} does not say that cif exported it, so its edits cannot be told; import it without a base to get a \
          scene of its own"

@@ -90,7 +90,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn missing_folders_are_told() {
+    fn missing_folders_are_reported() {
         assert_eq!(existing_folder(Path::new("a.glb")).unwrap(), Path::new("."));
         let error = existing_folder(Path::new("no such/place/a.glb")).unwrap_err().to_string();
         assert!(error.starts_with("no such/place: no such folder; create it first"), "{error}");

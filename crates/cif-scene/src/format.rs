@@ -122,10 +122,10 @@ pub trait SceneFormat: Sync {
     fn query(
         &self,
         path: &Path,
-        wanted: &LabelQuery,
+        label_query: &LabelQuery,
         options: ReadOptions,
     ) -> Result<Vec<LabelMatch>, FormatError> {
-        Ok(query(&self.read(path, options)?, wanted, &path.display().to_string())?)
+        Ok(query(&self.read(path, options)?, label_query, &path.display().to_string())?)
     }
 
     /// Objects of a file that meet every condition.
@@ -135,11 +135,11 @@ pub trait SceneFormat: Sync {
     fn search(
         &self,
         path: &Path,
-        wanted: &ObjectQuery,
+        query: &ObjectQuery,
         options: ReadOptions,
     ) -> Result<Vec<ObjectMatch>, FormatError> {
         let found: Result<_, QueryError> =
-            search(&self.read(path, options)?, wanted, &path.display().to_string(), str::to_owned);
+            search(&self.read(path, options)?, query, &path.display().to_string(), str::to_owned);
         Ok(found?)
     }
 }
@@ -160,7 +160,7 @@ pub struct About {
     pub most_expensive_motion: Option<MotionModel>,
     /// Advice on a scene that lies elsewhere in the world of its capture, where files do not place it.
     pub note_on_place: Option<&'static str>,
-    /// Keys of [`ExportOptions`], beside `force`, that a single file of this format knows.
+    /// Keys of [`ExportOptions`], in addition to `force`, that a single file of this format knows.
     pub options: &'static [&'static str],
     /// False for files that are made to be looked at, and not read back.
     pub is_read: bool,
@@ -247,7 +247,7 @@ pub struct ExportOptions {
     pub force: bool,
     /// USD: where the arrays of instances go.
     pub payloads: Payloads,
-    /// USD: write the variants `half` and `quarter` of the set `lod` beside `full`.
+    /// USD: write the variants `half` and `quarter` of the set `lod` in addition to `full`.
     pub levels_of_detail: bool,
     /// USD: a plane that simulators let things fall on. Default none.
     pub ground: Ground,

@@ -112,7 +112,7 @@ pub(crate) fn local_splats_at(
     }
 }
 
-/// The normalised mixture of two unit quaternions, the short way.
+/// The normalised mixture of two unit quaternions, along the shorter arc.
 pub(crate) fn normalized_lerp(a: [f64; 4], b: [f64; 4], fraction: f64) -> [f64; 4] {
     let sign = if dot(a, b) < 0.0 { -1.0 } else { 1.0 };
     let mixed = std::array::from_fn(|k| (1.0 - fraction) * a[k] + fraction * sign * b[k]);
@@ -129,7 +129,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn quaternions_mix_the_short_way() {
+    fn quaternions_mix_along_the_shorter_arc() {
         let half = std::f64::consts::FRAC_1_SQRT_2;
         let (a, b) = ([1.0, 0.0, 0.0, 0.0], [half, half, 0.0, 0.0]);
         let middle = normalized_lerp(a, b.map(|v| -v), 0.5);

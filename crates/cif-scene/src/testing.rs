@@ -1,4 +1,4 @@
-//! Scenes with recorded motion, for the tests of the way back.
+//! Scenes with recorded motion, for the tests of imports.
 
 use cif_field::tracks::{DenseTrack, NO_GROUP, TrackGroup, TrackPose, Tracks, VisibilityStep};
 use cif_field::{Field, Gaussians, Identities, Instance, RecordedCamera, SortMetric, Timeline};
@@ -35,7 +35,7 @@ impl Numbers {
 }
 
 /// `objects` instances one metre apart and a background. By turns an object stands still, turns and travels,
-/// deforms, or appears at frame 2. Object k has id 3 k + 2. Occupancies are anything: owners are told.
+/// deforms, or appears at frame 2. Object k has id 3 k + 2. Occupancies are anything: owners are given.
 pub(crate) fn recorded_field(objects: usize, seed: u64) -> Field {
     let mut numbers = Numbers::new(seed);
     let mut gaussians = Gaussians::default();

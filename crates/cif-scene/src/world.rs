@@ -63,8 +63,8 @@ mod tests {
         field.record.frame = CaptureFrame { offset: [3e6, -2e5, 14.5], scale: 1e-3 };
         assert_eq!(frame_of(&field).unwrap(), field.record.frame);
         field.record.frame.scale = 0.0;
-        let told = frame_of(&field).unwrap_err().to_string();
-        assert!(told.contains("train the scene again"), "{told}");
+        let message = frame_of(&field).unwrap_err().to_string();
+        assert!(message.contains("train the scene again"), "{message}");
     }
 
     #[test]

@@ -66,7 +66,7 @@ impl fmt::Display for Bytes {
     }
 }
 
-/// Bytes that this process can still take; `None` where the system does not tell.
+/// Bytes that this process can still take; `None` where the system does not report them.
 #[must_use]
 pub fn available() -> Option<u64> {
     let machine = read_to_string("/proc/meminfo").ok().and_then(|text| kilobytes(&text, "MemAvailable:"));
@@ -162,8 +162,11 @@ mod tests {
         assert_eq!(need(1).check(), Ok(()));
         assert_eq!(kilobytes("MemFree: 3 kB\nMemAvailable:   5 kB\n", "MemAvailable:"), Some(5120));
         if available().is_some() {
-            let told = need(1 << 62).check().unwrap_err().to_string();
-            assert!(told.contains("4611686018.4 GB") && told.contains("2 halves x 2^61 bytes"), "{told}");
+            let message = need(1 << 62).check().unwrap_err().to_string();
+            assert!(
+                message.contains("4611686018.4 GB") && message.contains("2 halves x 2^61 bytes"),
+                "{message}"
+            );
         }
     }
 }

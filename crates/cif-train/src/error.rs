@@ -44,12 +44,12 @@ pub enum TrainError {
         /// Folder of the capture.
         root: PathBuf,
     },
-    /// The motion of an object is told that the capture does not have.
+    /// Motion is given of an object that the capture does not have.
     #[error("{}: the motion of `{label}` is told, but no instance has this label; {known}", root.display())]
     UnknownObject {
         /// Folder of the capture.
         root: PathBuf,
-        /// Label that was told.
+        /// Label that was given.
         label: String,
         /// Labels of the capture, in words.
         known: String,

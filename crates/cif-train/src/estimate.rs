@@ -87,7 +87,7 @@ pub fn estimate(
     let truncation = f64::from(config.truncation);
 
     // Share of a Gaussian's mass that lies on labelled pixels, sum n / d. It leaves the softmax untouched and
-    // tells the background from the instances later on.
+    // distinguishes the background from the instances later on.
     let share = |row: usize| -> Option<f64> {
         let (total, labelled) = (counts.total_mass(row), mass_of(counts.row(row)));
         (total >= min_mass).then(|| (labelled / total).clamp(MIN_LABELLED_SHARE, 1.0))

@@ -1,6 +1,6 @@
 //! Exposure and white balance per camera, or per image of cameras that adapt while they film: what is recorded is an
 //! affine function, per channel, of what is there. The field keeps the mean look; what each camera makes of it is learnt
-//! beside it.
+//! separately.
 
 mod brightness;
 

@@ -73,7 +73,7 @@ struct Decoding {
 /// nearly as often as right (measured on propagated masks).
 const LEAST_CONFIDENCE: u8 = 192;
 
-/// Frames that tell whether masks are rough.
+/// Frames that decide whether masks are rough.
 const LOOKED: usize = 32;
 
 /// Frames decoded together before the budget is looked at again.
@@ -239,7 +239,7 @@ impl FrameStore {
 
     /// Leaves out the training frames whose masks contradict the others (see [`misfits`]), also of what was `read`;
     /// their indices in the capture.
-    pub(crate) fn leave_out_misfits(
+    pub(crate) fn leave_out_outliers(
         &mut self,
         dataset: &Dataset,
         read: &mut Vec<ReadMasks>,
@@ -282,7 +282,7 @@ impl FrameStore {
     }
 
     /// Moves the outlines of masks to where colours change if they are rough (see [`crate::mask_edges`]); true where
-    /// they are. Masks that tell how sure they are, pixel by pixel, stay.
+    /// they are. Masks that state how sure they are, pixel by pixel, stay.
     pub(crate) fn put_edges_right(&mut self, dataset: &Dataset, phases: &Phases) -> Result<bool, TrainError> {
         let is_plain = |k: &usize| dataset.frames[self.index(*k)].confidence.is_none();
         let plain: Vec<usize> = (0..self.len()).filter(is_plain).collect();

@@ -1,11 +1,11 @@
-//! Steps that leave the finite numbers: found before anything has moved, told, counted.
+//! Steps that leave the finite numbers: found before anything has moved, reported, counted.
 //!
 //! The gradients of a step are looked at before the optimiser touches anything, so that a bad step leaves
 //! parameters and moments exactly as they were. The run then goes on with the next views, since a single view
 //! may be at fault; after [`MAX_ROLLBACKS_IN_A_ROW`] bad steps it stops.
 //!
 //! [`Trainer::set_debug_validation`](crate::Trainer::set_debug_validation) also looks at every array on the way from
-//! the field to the gradients and back, which tells where the value first appeared.
+//! the field to the gradients and back, which shows where the value first appeared.
 
 use cif_field::Field;
 use cif_render::Gradients;

@@ -36,7 +36,7 @@ pub(crate) struct Guidance {
 }
 
 impl Guidance {
-    /// True when Gaussians of travelling objects are told from the others.
+    /// True when Gaussians of travelling objects are distinguished from the others.
     pub(crate) fn knows_what_travels(&self) -> bool {
         !self.guides.is_empty()
     }

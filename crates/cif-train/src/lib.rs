@@ -22,7 +22,7 @@
 //! | [`estimate`] | whose each Gaussian is, from masks |
 //! | `engine` | what computes the steps of a run: the processor, or a GPU |
 //! | `objects` | how rigid objects get poses, before the scene is trained |
-//! | [`heads`] | what the instance stage learns, and how pixels tell it |
+//! | [`heads`] | what the instance stage learns, and how pixels decode to labels |
 //! | `switches` | which masks show another object than theirs |
 //! | `mask_table` | where masks are, how large, and what they touch, read in one pass |
 //! | `mask_edges` | where the outlines of rough masks belong |

@@ -31,15 +31,15 @@ const ROUNDS: usize = 2;
 /// Share of the votes of two labels, and votes at the smallest distance, from which a pixel is clearly wrong.
 const CLEAR: (f32, f32) = (0.8, 3.0);
 
-/// Clearly wrong pixels, of those beside an outline, from which masks are rough. Exact masks of five
+/// Clearly wrong pixels, of those adjacent to an outline, from which masks are rough. Exact masks of five
 /// captures have 0.003 to 0.010 of them, those of a tracker with its errors 0.041 to 0.060.
 const ROUGH: f64 = 0.03;
 
-/// Pixels that are clearly wrong, and those beside outlines, of some masks.
+/// Pixels that are clearly wrong, and those adjacent to outlines, of some masks.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Doubt {
     wrong: usize,
-    beside: usize,
+    adjacent: usize,
 }
 
 impl Doubt {
@@ -48,18 +48,18 @@ impl Doubt {
         let ballot = Ballot::new(image, labels);
         let wrong =
             ballot.near().filter_map(|[x, y]| ballot.winner(x, y)).filter(|winner| winner.clear).count();
-        let is_beside = |&[x, y]: &[u32; 2]| ballot.differs(x, y, 1);
-        Self { wrong, beside: ballot.near().filter(is_beside).count() }
+        let is_adjacent = |&[x, y]: &[u32; 2]| ballot.differs(x, y, 1);
+        Self { wrong, adjacent: ballot.near().filter(is_adjacent).count() }
     }
 
     /// That of several images.
     pub(crate) fn sum(all: impl Iterator<Item = Self>) -> Self {
-        all.fold(Self::default(), |a, b| Self { wrong: a.wrong + b.wrong, beside: a.beside + b.beside })
+        all.fold(Self::default(), |a, b| Self { wrong: a.wrong + b.wrong, adjacent: a.adjacent + b.adjacent })
     }
 
     /// True where so many are wrong that outlines are better moved.
     pub(crate) fn is_rough(&self) -> bool {
-        self.wrong as f64 > ROUGH * self.beside as f64
+        self.wrong as f64 > ROUGH * self.adjacent as f64
     }
 }
 
@@ -229,17 +229,17 @@ mod tests {
     }
 
     #[test]
-    fn rough_masks_are_told_from_exact_ones() {
+    fn rough_masks_are_distinguished_from_exact_ones() {
         let (image, truth) = scene();
         assert!(!Doubt::of(&image, &truth).is_rough());
         // Colours of both sides in the pixels of an outline are no doubt.
         let blend = |pixel: usize| {
             let (x, y) = (pixel as u32 % SIZE, pixel as u32 / SIZE);
             let near = |at: u32| at.saturating_sub(1)..(at + 2).min(SIZE);
-            let beside: Vec<[u8; 3]> =
+            let around: Vec<[u8; 3]> =
                 near(y).flat_map(|y| near(x).map(move |x| (x, y))).map(|(x, y)| *image.at(x, y)).collect();
             [0, 1, 2].map(|k| {
-                (beside.iter().map(|color| u32::from(color[k])).sum::<u32>() / beside.len() as u32) as u8
+                (around.iter().map(|color| u32::from(color[k])).sum::<u32>() / around.len() as u32) as u8
             })
         };
         let soft = PixelGrid::from_pixels(SIZE, SIZE, (0..image.pixels.len()).map(blend).collect());

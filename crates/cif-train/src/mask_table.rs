@@ -119,7 +119,7 @@ mod tests {
 
     #[test]
     fn a_table_holds_what_masks_cover_and_touch() {
-        // A block of 3 x 2 on the left border, a bar of two pixels beside it.
+        // A block of 3 x 2 on the left border, a bar of two pixels next to it.
         let label = |x: u32, y: u32| match (x, y) {
             (0..3, 1..3) => 4,
             (3, 1..3) => 7,

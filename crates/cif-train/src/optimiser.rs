@@ -64,8 +64,8 @@ impl StepRates {
     }
 
     /// The same for some parameters; the others keep still.
-    pub(crate) fn only(mut self, wanted: &[Parameter]) -> Self {
-        self.0.retain(|(parameter, _)| wanted.contains(parameter));
+    pub(crate) fn only(mut self, chosen: &[Parameter]) -> Self {
+        self.0.retain(|(parameter, _)| chosen.contains(parameter));
         self
     }
 

@@ -68,7 +68,7 @@ pub(crate) struct Progress {
     pub opacities_were_reset: bool,
     /// Running mean PSNR of training views, dB.
     pub psnr: Option<f64>,
-    /// True when the user was told about unsupported pixels.
+    /// True when the user was warned about unsupported pixels.
     pub warned_of_unsupported: bool,
     /// Steps that were rolled back.
     #[serde(default, skip_serializing_if = "Rollbacks::is_empty")]
@@ -86,7 +86,7 @@ pub(crate) struct Goals {
     pub targets: Targets,
     /// True when all of it was.
     pub reached: bool,
-    /// True when the user was told that a target is out of reach.
+    /// True when the user was warned that a target is out of reach.
     pub doubted: bool,
 }
 

@@ -41,7 +41,7 @@ pub(crate) enum Purpose {
     Contributions = 17,
 }
 
-/// The stream of a purpose; `counter` tells its uses apart.
+/// The stream of a purpose; `counter` distinguishes its uses.
 pub(crate) fn stream(seed: u64, purpose: Purpose, counter: u64) -> Pcg64 {
     Pcg64::seed_from_u64(derive(seed, purpose, counter))
 }

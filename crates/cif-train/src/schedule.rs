@@ -209,7 +209,7 @@ const RENORMALISE_EVERY: u64 = 1_000;
 /// masks: what was taken out of the network too early needs time to recover.
 const MASKS_STEPS: f64 = 15.0;
 
-/// Facts about a run, beside its settings, that decide what falls on its steps.
+/// Facts about a run, in addition to its settings, that decide what falls on its steps.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Facts {
     /// Stages that the capture has.
@@ -617,7 +617,7 @@ mod tests {
         assert_eq!(
             walk(whole, &config),
             [Coarse, Objects, Fine, Identity, Instance, Done],
-            "what rests is held"
+            "what is at rest is held"
         );
         config.motion.stillness = 0.0;
         assert_eq!(walk(whole, &config), [Coarse, Fine, Identity, Instance, Done]);

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use crate::tracks::Observation;
 
-/// Share of its usual area from which an instance counts as seen whole.
+/// Share of its median area from which an instance counts as seen whole.
 const WHOLE: f64 = 0.5;
 
 /// Pixels below which masks come and go with the tracker.
@@ -80,7 +80,7 @@ mod tests {
     /// An instance of so many pixels at every time, 0 where it is not seen, by camera.
     fn seen(areas: &[&[u32]]) -> [bool; 2] {
         let names: Vec<String> = (0..areas.len()).map(|camera| camera.to_string()).collect();
-        let mut sightings = Sightings::default();
+        let mut observations = Sightings::default();
         for time in 0..areas[0].len() {
             for (camera, areas) in areas.iter().enumerate() {
                 let observation = Observation {
@@ -92,10 +92,10 @@ mod tests {
                     contact_depth: None,
                 };
                 let seen = (areas[time] > 0).then_some((1, observation));
-                sightings.add(&names[camera], time, seen.into_iter().collect());
+                observations.add(&names[camera], time, seen.into_iter().collect());
             }
         }
-        [sightings.appears(1), sightings.vanishes(1)]
+        [observations.appears(1), observations.vanishes(1)]
     }
 
     #[test]

@@ -94,7 +94,7 @@ impl State {
         heads::value_head(&self.head, &self.config)
     }
 
-    /// The same once it has started, where it tells labels: views then show them.
+    /// The same once it has started, where it decodes labels: views then show them.
     pub(crate) fn started_head(&self) -> Option<&dyn ValueHead> {
         self.value_head().filter(|head| head.target() == Target::Labels && !self.head_tensors.is_empty())
     }
@@ -122,7 +122,7 @@ impl State {
         (0..self.field.len()).map(made_for).collect()
     }
 
-    /// Motion that an object (a label: dense index + 1) is told to have.
+    /// Motion that an object (a label: dense index + 1) is declared to have.
     pub(crate) fn told(&self, label: u16) -> Option<ObjectMotion> {
         let name = &self.field.instances[usize::from(label) - 1].label;
         self.config.motion.of.get(name).copied()

@@ -1,7 +1,7 @@
 //! Where objects travel, from masks alone: a path of the centre per instance, before any motion is learnt.
 //!
-//! One moving camera does not tell how far a moving object is. Three things do, each roughly: an object that
-//! rests on something is as far as what is seen right below it (the contact), its apparent size says how its
+//! One moving camera does not show how far away a moving object is. Three things do, each roughly: an object that
+//! stands on something is as far away as what is seen right below it (the contact), its apparent size says how its
 //! distance changes, and real objects neither jump nor change speed without cause. The path is the robust
 //! least-squares solution of all three with the directions in which the mask's centre is seen.
 
@@ -209,7 +209,7 @@ pub fn fit(observations: &[Observation]) -> Option<Track> {
     centres.iter().all(|centre| centre.is_finite()).then_some(Track { time_indices, centres, radius })
 }
 
-/// The path of an instance that does not travel (see [`travels`]): it rests where its masks agree best. `None` with too few
+/// The path of an instance that does not travel (see [`travels`]): it stands where its masks agree best. `None` with too few
 /// observations, and where some camera does not see that point.
 pub(crate) fn resting(observations: &[Observation]) -> Option<Track> {
     if observations.len() < FEWEST {
@@ -229,15 +229,15 @@ pub(crate) fn resting(observations: &[Observation]) -> Option<Track> {
 /// Without observations.
 pub(crate) fn on_rays(observations: &[Observation], middle: DVec3) -> Track {
     let mut contacts: Vec<f64> = observations.iter().filter_map(|o| o.contact_depth).collect();
-    let usual = median(&mut contacts);
+    let median_depth = median(&mut contacts);
     let depth_of = |o: &Observation| {
-        let known = o.contact_depth.or(usual);
+        let known = o.contact_depth.or(median_depth);
         known.unwrap_or_else(|| (middle - o.camera.centre()).length())
     };
     let depths: Vec<f64> = observations.iter().map(depth_of).collect();
     let radius = radius(observations, &depths);
     let (mut time_indices, mut centres) = (Vec::new(), Vec::new());
-    // Where several cameras see a time, the largest mask tells most.
+    // Where several cameras see a time, the largest mask counts.
     let of_times = observations.iter().zip(depths);
     for seen in of_times.collect::<Vec<_>>().chunk_by(|(a, _), (b, _)| a.time_index == b.time_index) {
         if let Some((o, depth)) = seen.iter().max_by(|(a, _), (b, _)| a.area_px.total_cmp(&b.area_px)) {
@@ -257,7 +257,7 @@ fn radius(observations: &[Observation], depths: &[f64]) -> f64 {
 
 impl Track {
     /// Centre at a time between two of `times`, by their indices; before the first and after the last
-    /// sighting it rests.
+    /// observation it stands still.
     #[must_use]
     pub fn at(&self, times: &[f64], time: f64) -> DVec3 {
         let after = self.time_indices.partition_point(|index| times[*index] <= time);

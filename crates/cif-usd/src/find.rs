@@ -17,22 +17,22 @@ use crate::{ReadOptions, UsdError, conventions, tokens};
 
 pub(crate) fn search(
     path: &Path,
-    wanted: &ObjectQuery,
+    query: &ObjectQuery,
     options: ReadOptions,
 ) -> Result<Vec<ObjectMatch>, UsdError> {
-    let label_query = wanted.label_query();
+    let label_query = query.label_query();
     let matcher = label_query.as_ref().map(LabelQuery::matcher);
     pxr::with(|pxr| {
         let (stage, instances) = open_for_labels(pxr, path, options)?;
         let python =
             |error: PyErr| UsdError::Unusable { path: path.to_owned(), reason: reason(pxr.py, &error) };
-        let search = Search::new(pxr, &stage, wanted).map_err(python)?;
+        let search = Search::new(pxr, &stage, query).map_err(python)?;
         let (mut known, mut labelled, mut found) = (Vec::new(), false, Vec::new());
         for prim in all_prims(pxr, &stage, instances).map_err(python)? {
             let prim = prim.map_err(python)?;
             let by_taxonomy = search.labels.of(&prim).map_err(python)?;
             let counted =
-                by_taxonomy.iter().filter(|(taxonomy, labels)| wanted.counts(taxonomy) && !labels.is_empty());
+                by_taxonomy.iter().filter(|(taxonomy, labels)| query.counts(taxonomy) && !labels.is_empty());
             let labels: Vec<String> = counted.flat_map(|(_, labels)| labels.clone()).collect();
             let carries = match &matcher {
                 Some(pattern) => labels.iter().any(|label| pattern.matches(label)),
@@ -40,7 +40,7 @@ pub(crate) fn search(
             };
             known.extend(labels);
             labelled |= carries;
-            if carries && let Some(object) = search.describe(&prim, &by_taxonomy, wanted).map_err(python)? {
+            if carries && let Some(object) = search.describe(&prim, &by_taxonomy, query).map_err(python)? {
                 found.push(object);
             }
         }
@@ -85,16 +85,16 @@ struct Search<'a, 'py> {
 }
 
 impl<'a, 'py> Search<'a, 'py> {
-    fn new(pxr: &'a Pxr<'py>, stage: &Bound<'py, PyAny>, wanted: &ObjectQuery) -> PyResult<Self> {
+    fn new(pxr: &'a Pxr<'py>, stage: &Bound<'py, PyAny>, query: &ObjectQuery) -> PyResult<Self> {
         let number = |name: &str| -> PyResult<f64> { stage.call_method0(name)?.extract() };
         let (start, end) = (number("GetStartTimeCode")?, number("GetEndTimeCode")?);
-        let codes = sampled_codes(wanted.when, start, end);
+        let codes = sampled_codes(query.when, start, end);
         let code = |code: Option<f64>| pxr.time_code(code);
-        let time = match wanted.when {
+        let time = match query.when {
             When::Default => code(None)?,
             When::At(at) | When::Over(at, _) => code(Some(at))?,
         };
-        let span = match wanted.when {
+        let span = match query.when {
             When::Over(first, last) => pxr.gf.getattr("Interval")?.call1((first, last))?,
             _ => time.clone(),
         };
@@ -108,7 +108,7 @@ impl<'a, 'py> Search<'a, 'py> {
             pxr,
             labels_api: pxr.usd_semantics.getattr("LabelsAPI")?,
             transforms: times.iter().map(transform_at).collect::<PyResult<_>>()?,
-            boxes: match wanted.when {
+            boxes: match query.when {
                 When::Over(..) => times.iter().map(box_at).collect::<PyResult<_>>()?,
                 _ => Vec::new(),
             },
@@ -126,7 +126,7 @@ impl<'a, 'py> Search<'a, 'py> {
         &self,
         prim: &Bound<'py, PyAny>,
         by_taxonomy: &BTreeMap<String, Vec<String>>,
-        wanted: &ObjectQuery,
+        query: &ObjectQuery,
     ) -> PyResult<Option<ObjectMatch>> {
         if !self.visible(prim)? {
             return Ok(None);
@@ -137,7 +137,7 @@ impl<'a, 'py> Search<'a, 'py> {
         for cache in caches {
             bounds = bounds.union(world_box(cache, prim)?);
         }
-        if !wanted.is_at(&bounds) {
+        if !query.is_at(&bounds) {
             return Ok(None);
         }
         let first = |taxonomy: &str| {

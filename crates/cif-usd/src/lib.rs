@@ -130,19 +130,19 @@ impl SceneFormat for Usd {
     fn query(
         &self,
         path: &Path,
-        wanted: &LabelQuery,
+        label_query: &LabelQuery,
         options: ReadOptions,
     ) -> Result<Vec<LabelMatch>, FormatError> {
-        Ok(query(path, wanted, options)?)
+        Ok(query(path, label_query, options)?)
     }
 
     fn search(
         &self,
         path: &Path,
-        wanted: &ObjectQuery,
+        query: &ObjectQuery,
         options: ReadOptions,
     ) -> Result<Vec<ObjectMatch>, FormatError> {
-        Ok(search(path, wanted, options)?)
+        Ok(search(path, query, options)?)
     }
 }
 
@@ -179,8 +179,8 @@ pub fn query(path: &Path, query: &LabelQuery, options: ReadOptions) -> Result<Ve
 ///
 /// # Errors
 /// As [`query`].
-pub fn search(path: &Path, wanted: &ObjectQuery, options: ReadOptions) -> Result<Vec<ObjectMatch>, UsdError> {
-    with_usd!(find::search(path, wanted, options))
+pub fn search(path: &Path, query: &ObjectQuery, options: ReadOptions) -> Result<Vec<ObjectMatch>, UsdError> {
+    with_usd!(find::search(path, query, options))
 }
 
 /// Range of the time codes of any stage; without ends where its root layer does not say.

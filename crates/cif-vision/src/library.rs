@@ -102,7 +102,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_library_is_told_from_its_providers() {
+    fn the_library_is_distinguished_from_its_providers() {
         let folder = tempfile::tempdir().unwrap();
         for name in ["libonnxruntime_providers_shared.so", "onnxruntime_pybind11_state.so", "__init__.py"] {
             std::fs::write(folder.path().join(name), "").unwrap();
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn pythons_without_the_package_are_told() {
+    fn pythons_without_the_package_are_reported() {
         let named = find_named(Some("no/libonnxruntime.so".into()), &[]).unwrap_err().to_string();
         assert!(named.contains(VARIABLE) && named.contains("no/libonnxruntime.so"), "{named}");
         let folder = tempfile::tempdir().unwrap();

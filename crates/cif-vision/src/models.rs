@@ -210,8 +210,8 @@ impl Models {
 fn with_data(file: &Path) -> Vec<PathBuf> {
     let name = file.file_name().unwrap_or_default().as_encoded_bytes();
     let mut files = vec![file.to_owned()];
-    let beside = file.parent().and_then(|folder| std::fs::read_dir(folder).ok());
-    files.extend(beside.into_iter().flatten().flatten().map(|entry| entry.path()).filter(|path| {
+    let siblings = file.parent().and_then(|folder| std::fs::read_dir(folder).ok());
+    files.extend(siblings.into_iter().flatten().flatten().map(|entry| entry.path()).filter(|path| {
         let other = path.file_name().unwrap_or_default().as_encoded_bytes();
         other.len() > name.len() && other.starts_with(name)
     }));

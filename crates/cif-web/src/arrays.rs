@@ -72,7 +72,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn values_come_back_as_precisely_as_told() {
+    fn values_come_back_as_precisely_as_stated() {
         let values = [0.0_f32, -3.25, 1e-3, 2.5, 0.7, -0.1, 3.1];
         let mut block = Block::default();
         let arrays =

@@ -13,7 +13,7 @@ use crate::document::{
     Visibility,
 };
 
-/// Near plane of scenes that tell none, world units: that of the renderers of cif.
+/// Near plane of scenes that state none, world units: that of the renderers of cif.
 pub const NEAR: f32 = 0.2;
 
 /// A document and its block of bytes.
@@ -110,7 +110,7 @@ pub fn describe(
 const UPRIGHT: f64 = std::f64::consts::FRAC_1_SQRT_2;
 
 /// The unit vector that points up: the declared axis, unless the cameras of the scene stand otherwise, as in captures
-/// whose world is turned any way.
+/// whose world has any orientation.
 #[must_use]
 pub fn up<'a>(axis: UpAxis, cameras: impl IntoIterator<Item = &'a PinholeCamera>) -> [f64; 3] {
     let declared = match axis {

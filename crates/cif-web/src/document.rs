@@ -1,4 +1,4 @@
-//! A scene as the page reads it: a JSON document, and arrays in a block of bytes beside it.
+//! A scene as the page reads it: a JSON document, and arrays in a block of bytes next to it.
 //!
 //! Frames are those of scene graphs: world as captured, right-handed; cameras look along +z with x right and y down; the
 //! centre of the first pixel is (0.5, 0.5); quaternions are (w, x, y, z). Times are time codes, which are frames as

@@ -223,6 +223,6 @@ fn pages_of_others_stay_and_are_not_read() {
     assert!(std::fs::read_to_string(&path).unwrap().contains("mine"));
     export(&graph(), &path, ExportOptions { force: true, ..ExportOptions::default() }, color).unwrap();
     export(&graph(), &path, ExportOptions::default(), color).unwrap();
-    let told = HTML.read(&path, ReadOptions::default()).unwrap_err().to_string();
-    assert!(told.contains("made to be looked at") && told.contains(".usda"), "{told}");
+    let message = HTML.read(&path, ReadOptions::default()).unwrap_err().to_string();
+    assert!(message.contains("made to be looked at") && message.contains(".usda"), "{message}");
 }

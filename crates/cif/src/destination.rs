@@ -152,8 +152,8 @@ impl Destination {
         let name = self.path.display();
         let message = format!("{name} was written by something else while this run went on, and is kept");
         let stem = self.path.file_stem().unwrap_or_default().to_string_lossy();
-        let beside = (2..1_000).map(|k| self.path.with_file_name(format!("{stem}-{k}.cif")));
-        for path in beside {
+        let candidates = (2..1_000).map(|k| self.path.with_file_name(format!("{stem}-{k}.cif")));
+        for path in candidates {
             match save_anew(checkpoint, &path) {
                 Ok(true) => {
                     let help = if checkpoint.training.is_some() {

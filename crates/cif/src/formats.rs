@@ -221,8 +221,8 @@ mod tests {
         for (name, ways) in
             [("a.SPZ", ["splat-transform a.SPZ a.ply", ".glb"]), ("a.obj", ["not known", ".ply"])]
         {
-            let told = Content::of(Path::new(name)).err().unwrap().with_help();
-            assert!(ways.iter().all(|way| told.contains(way)), "{told}");
+            let message = Content::of(Path::new(name)).err().unwrap().with_help();
+            assert!(ways.iter().all(|way| message.contains(way)), "{message}");
         }
         assert_eq!(endings(), ".usda, .usdc, .usdz, .usd (USD), .glb, .gltf (glTF) or .ply (PLY)");
     }

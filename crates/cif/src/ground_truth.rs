@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn shifts_and_turns_are_told_apart() {
+    fn shifts_and_turns_are_distinguished() {
         let shifted = &compare(&exported(DVec3::new(0.0, 0.0, 0.003), 0.0), &truth("rigid"))[0];
         assert!((shifted.translation_max_mm - 3.0).abs() < 1e-9, "{shifted:?}");
         assert!((shifted.translation_rms_mm - (9.0_f64 / 3.0).sqrt()).abs() < 1e-9, "{shifted:?}");

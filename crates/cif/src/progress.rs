@@ -432,7 +432,7 @@ mod tests {
     }
 
     #[test]
-    fn times_of_phases_are_told_in_their_order_and_add_up() {
+    fn times_of_phases_are_reported_in_their_order_and_add_up() {
         let times = [("fine", 120.0), ("objects", 61.0), ("save", 0.4), ("open", 0.3), ("later", 3.0)];
         let times = times.into_iter().map(|(name, s)| (name.to_owned(), s)).collect();
         // Phases of other versions are kept by their names.

@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn files_of_reports_are_told_from_other_arguments() {
+    fn files_of_reports_are_distinguished_from_other_arguments() {
         for (line, expected) in [
             ("cif info --json table", "cif info --json table"),
             ("cif info table --json", "cif info table --json"),

@@ -1,4 +1,4 @@
-//! What accuracy costs, told: the curve of a run, budgets and targets, drafts, and the report of ladders. How long
+//! Reports of the cost of accuracy: the curve of a run, budgets and targets, drafts, and the report of ladders. How long
 //! anything takes is not tested.
 
 use std::fs;
@@ -36,8 +36,8 @@ fn a_run_tells_its_curve_and_a_draft_its_error() {
     assert_eq!(measured.len(), 4);
     assert_eq!(measured[1]["psnr"], points[1]["psnr"]);
 
-    let told = cif(path, "render table.cif --capture table -o draft --quality draft").succeeds().stderr;
-    assert!(told.contains("draft: PSNR") && told.contains("of 2 views measured"), "{told}");
+    let stderr = cif(path, "render table.cif --capture table -o draft --quality draft").succeeds().stderr;
+    assert!(stderr.contains("draft: PSNR") && stderr.contains("of 2 views measured"), "{stderr}");
     cif(path, "render table.cif --capture table -o final").succeeds();
     let picture = |folder: &str| image_size(&path.join(folder).join("rgb/000002.png"));
     assert_eq!(picture("draft"), picture("final"));
@@ -52,9 +52,9 @@ fn image_size(path: &Path) -> (u32, u32) {
 fn a_budget_says_what_it_buys_and_writes_the_settings_that_came_of_it() {
     let folder = capture::in_folder(8);
     let path = folder.path();
-    let told = cif(path, &format!("train table -o table.cif --budget 2s {SMALL}")).succeeds().stderr;
-    assert!(told.contains("budget 2 s: the settings of standard would take about"), "{told}");
-    assert!(told.contains("of the budget of 2 s") && told.contains("\ntime: "), "{told}");
+    let stderr = cif(path, &format!("train table -o table.cif --budget 2s {SMALL}")).succeeds().stderr;
+    assert!(stderr.contains("budget 2 s: the settings of standard would take about"), "{stderr}");
+    assert!(stderr.contains("of the budget of 2 s") && stderr.contains("\ntime: "), "{stderr}");
     let settings = fs::read_to_string(path.join("table.train.toml")).unwrap();
     let settings: toml::Table = settings.parse().unwrap();
     let facts = json(&cif(path, "info table.cif --json").succeeds().stdout);
@@ -64,7 +64,7 @@ fn a_budget_says_what_it_buys_and_writes_the_settings_that_came_of_it() {
         assert!(steps[stage].as_i64() > Some(0));
     }
     assert_eq!(facts["provenance"]["train"]["goals"]["budget"]["seconds"], 2.0);
-    // Of the phases that are told, those too short to be seen are left out; they count all the same.
+    // Of the phases that are reported, those too short to be seen are left out; they count all the same.
     let times = &facts["provenance"]["train"]["wall_s_by_phase"];
     assert!(times["open"].as_f64() > Some(0.0) && times["fine"].as_f64() > Some(0.0), "{times}");
 
@@ -81,10 +81,10 @@ fn captures_without_points_say_what_they_start_from() {
     let path = folder.path();
     fs::remove_file(path.join("table/points.npy")).unwrap();
     let short = format!("{SMALL} --iterations-coarse 3 --iterations-fine 3 --iterations-instance 0");
-    let told = cif(path, &format!("train table -o a.cif {short}")).succeeds().stderr;
+    let stderr = cif(path, &format!("train table -o a.cif {short}")).succeeds().stderr;
     // Which of the two depends on whether Python has pycolmap.
-    let found = told.contains("were triangulated from its images");
-    assert!(found != told.contains("points drawn at random"), "{told}");
+    let found = stderr.contains("were triangulated from its images");
+    assert!(found != stderr.contains("points drawn at random"), "{stderr}");
     let triangulates = |scene: &str| {
         let settings: toml::Table =
             fs::read_to_string(path.join(format!("{scene}.train.toml"))).unwrap().parse().unwrap();
@@ -101,8 +101,8 @@ fn a_target_stops_a_run() {
     let folder = capture::in_folder(8);
     let path = folder.path();
     let line = format!("train table -o table.cif --target-psnr 8 --target-miou 5 {SMALL}");
-    let told = cif(path, &line).succeeds().stderr;
-    assert!(told.contains("targets reached on 1 training frames withheld from training: PSNR"), "{told}");
+    let stderr = cif(path, &line).succeeds().stderr;
+    assert!(stderr.contains("targets reached on 1 training frames withheld from training: PSNR"), "{stderr}");
     let facts = json(&cif(path, "info table.cif --json").succeeds().stdout);
     let train = &facts["provenance"]["train"];
     assert!(train["iterations"].as_u64() < Some(2_500), "{train:#}");
@@ -118,11 +118,11 @@ fn a_report_holds_its_ladders_and_goes_on_where_it_stopped() {
     let line = format!(
         "bench accuracy table -o report --quick --ladders sh,storage,precision,render,export {short} {SMALL}"
     );
-    let told = cif(path, &line).succeeds().stderr;
+    let stderr = cif(path, &line).succeeds().stderr;
     // Three degrees, of which the highest is the base; four, three, five and four of the others. A quick report
     // begins with the base and ends with what trains longest.
-    assert!(told.contains("[1/19] sh: degree ") && told.contains("[17/19] export: 0.3 %: "), "{told}");
-    assert!(told.contains("[18/19] sh: degree 0: ") && !told.contains("left out"), "{told}");
+    assert!(stderr.contains("[1/19] sh: degree ") && stderr.contains("[17/19] export: 0.3 %: "), "{stderr}");
+    assert!(stderr.contains("[18/19] sh: degree 0: ") && !stderr.contains("left out"), "{stderr}");
     let page = fs::read_to_string(path.join("report/report.html")).unwrap();
     for word in [
         "View-dependent colour",
@@ -159,10 +159,10 @@ fn a_report_holds_its_ladders_and_goes_on_where_it_stopped() {
 
     // Everything is kept; a record that is gone is measured again, other settings make all of them void.
     fs::remove_file(path.join("report/rungs/sh-1.json")).unwrap();
-    let told = cif(path, &line).succeeds().stderr;
-    assert_eq!(told.matches(": kept, ").count(), 18, "{told}");
-    let told = cif(path, &format!("{line} --set seed=5")).succeeds().stderr;
-    assert_eq!(told.matches(": kept, ").count(), 0, "{told}");
+    let stderr = cif(path, &line).succeeds().stderr;
+    assert_eq!(stderr.matches(": kept, ").count(), 18, "{stderr}");
+    let stderr = cif(path, &format!("{line} --set seed=5")).succeeds().stderr;
+    assert_eq!(stderr.matches(": kept, ").count(), 0, "{stderr}");
     cif(path, "bench accuracy table -o table --quick").fails(1, &["not empty"]);
     cif(path, "bench accuracy table -o report --ladders none").fails(2, &["iterations", "export"]);
 }
@@ -176,10 +176,10 @@ fn the_configuration_of_the_paper_is_a_ladder_of_its_own_with_what_there_is_time
     let line = format!(
         "bench accuracy table -o paper --no-masks --ladders paper --paper-share 0.002 {paper} {base} {SMALL}"
     );
-    let told = cif(path, &line).succeeds().stderr;
+    let stderr = cif(path, &line).succeeds().stderr;
     assert!(
-        told.contains("[1/2] paper: base: ") && told.contains("[2/2] paper: paper, 0.2 % of its steps: "),
-        "{told}"
+        stderr.contains("[1/2] paper: base: ") && stderr.contains("[2/2] paper: paper, 0.2 % of its steps: "),
+        "{stderr}"
     );
     let report = json(&fs::read_to_string(path.join("paper/report.json")).unwrap());
     let rung = report["rungs"].as_array().unwrap().iter().find(|rung| rung["id"] == "paper").unwrap();
@@ -209,11 +209,15 @@ fn the_configuration_of_the_paper_is_a_ladder_of_its_own_with_what_there_is_time
     }
 
     // An image that changes in place, under its name, makes all that was measured on it void.
-    let told = cif(path, &line).succeeds().stderr;
-    assert_eq!(told.matches(": kept, ").count(), 2, "{told}");
+    let stderr = cif(path, &line).succeeds().stderr;
+    assert_eq!(stderr.matches(": kept, ").count(), 2, "{stderr}");
     fs::copy(path.join("table/rgb/1x/000001.png"), path.join("table/rgb/1x/000000.png")).unwrap();
-    let told = cif(path, &line).succeeds().stderr;
-    assert_eq!(told.matches("measured again: the image of frame 000000 has changed").count(), 2, "{told}");
+    let stderr = cif(path, &line).succeeds().stderr;
+    assert_eq!(
+        stderr.matches("measured again: the image of frame 000000 has changed").count(),
+        2,
+        "{stderr}"
+    );
 
     cif(path, "bench accuracy table -o x --paper-share 0.5").fails(2, &["--paper-share", "--ladders paper"]);
     cif(path, "bench accuracy table -o x --ladders paper --paper-share 0").fails(2, &["above 0"]);

@@ -118,7 +118,7 @@ fn the_instance_pass_is_compared_for_any_number_of_instances() {
     let facts_after = json(&cif(path, "info scene.cif --json").succeeds().stdout);
     assert_eq!(facts, facts_after, "measuring leaves the scene alone");
 
-    // Without a scene, identities are estimated on the way; the table tells the overhead.
+    // Without a scene, identities are estimated first; the table gives the overhead.
     let table = cif(path, &format!("bench step table --stage instance {SHORT}")).succeeds().stdout;
     assert!(table.contains("Instance pass on top of colour") && table.contains('%'), "{table}");
 }

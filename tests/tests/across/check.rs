@@ -1,4 +1,4 @@
-//! `cif check`: sound scenes pass, broken ones are told with counts and places, and repaired into a new file.
+//! `cif check`: sound scenes pass, broken ones are reported with counts and places, and repaired into a new file.
 
 use std::fs;
 use std::path::Path;
@@ -45,8 +45,8 @@ fn a_sound_scene_passes_and_a_broken_one_is_repaired() {
     assert!(sound.training.is_some());
     let report: Value = serde_json::from_str(&cif(path, "check table.cif --json").succeeds().stdout).unwrap();
     assert_eq!((&report["broken"], &report["views_checked"]), (&0.into(), &true.into()), "{report:#}");
-    let told = cif(path, "check table.cif").succeeds().stdout;
-    assert!(told.contains(&format!("{} Gaussians", sound.field.len())), "{told}");
+    let stdout = cif(path, "check table.cif").succeeds().stdout;
+    assert!(stdout.contains(&format!("{} Gaussians", sound.field.len())), "{stdout}");
 
     // Moments alone: the state of the training stays.
     fs::copy(path.join("table.cif"), path.join("moments.cif")).unwrap();
@@ -78,9 +78,9 @@ fn a_sound_scene_passes_and_a_broken_one_is_repaired() {
 
     cif(path, "check broken.cif --fix broken.cif").fails(2, &["broken.cif is read by this command"]);
     cif(path, "check broken.cif --fix table.cif").fails(1, &["exists"]);
-    let told = cif(path, "check broken.cif --fix repaired.cif").succeeds().stdout;
-    assert!(told.contains("3 x Gaussians that cannot be drawn were removed"), "{told}");
-    assert!(told.contains("training state was left out"), "{told}");
+    let stdout = cif(path, "check broken.cif --fix repaired.cif").succeeds().stdout;
+    assert!(stdout.contains("3 x Gaussians that cannot be drawn were removed"), "{stdout}");
+    assert!(stdout.contains("training state was left out"), "{stdout}");
     assert_eq!(fs::read(&broken).unwrap(), before, "the broken scene is kept as it is");
     let repaired = Checkpoint::load(path.join("repaired.cif")).unwrap();
     assert_eq!(repaired.field.len(), sound.field.len() - 3);
@@ -135,8 +135,8 @@ fn camera_sizes_are_checked_before_memory_is_taken() {
         assert_eq!(run.code, Some(1), "{}", run.stderr);
         let report: Value = serde_json::from_str(&run.stdout).unwrap();
         assert_eq!(report["views_checked"], false);
-        let told = report["findings"].to_string();
-        assert!(told.contains("camera") && told.contains(pixels), "{told}");
+        let findings = report["findings"].to_string();
+        assert!(findings.contains("camera") && findings.contains(pixels), "{findings}");
         cif(path, "render huge.cif --capture table -o out").fails(1, &["huge.cif", pixels]);
     }
     // As wide, and within the limit.

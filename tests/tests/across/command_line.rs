@@ -415,7 +415,7 @@ fn a_few_painted_frames_become_masks_of_all() {
     assert!(!facts.stderr.contains("belong to no frame"), "{}", facts.stderr);
     assert!(!facts.stdout.contains("belong to no frame"), "{}", facts.stdout);
 
-    // What is wrong is told, and nothing is left behind.
+    // Mistakes are reported, and nothing is left behind.
     let paint = |folder: &str, file: &str, width: u32, height: u32, id: u8| {
         fs::create_dir_all(path.join(folder)).unwrap();
         let grey = image::GrayImage::from_pixel(width, height, image::Luma([id]));
@@ -596,13 +596,13 @@ fn an_answer_that_is_lost_is_a_failure() {
     assert!(stderr.contains("cannot write to stdout") && !stderr.contains("panicked"), "{stderr}");
 }
 
-/// What a command told, a line each, of warnings or of notes.
-fn told<'a>(run: &'a Run, kind: &str) -> Vec<&'a str> {
+/// The warnings or notes of a command, a line each.
+fn messages<'a>(run: &'a Run, kind: &str) -> Vec<&'a str> {
     run.stderr.lines().filter(|line| line.starts_with(kind)).collect()
 }
 
 #[test]
-fn captures_that_a_scene_does_not_know_are_told() {
+fn captures_that_a_scene_does_not_know_are_reported() {
     let folder = with_capture();
     let path = folder.path();
     let tiny = "--iterations-coarse 2 --iterations-fine 2 --iterations-instance 2 -q \
@@ -610,7 +610,11 @@ fn captures_that_a_scene_does_not_know_are_told() {
     cif(path, &format!("train table -o table.cif {tiny}")).succeeds();
     for line in ["eval table.cif table", "eval table.cif table --split train --downscale 2"] {
         let run = cif(path, line).succeeds();
-        assert!(told(&run, "warning:").is_empty() && told(&run, "note:").is_empty(), "{}", run.stderr);
+        assert!(
+            messages(&run, "warning:").is_empty() && messages(&run, "note:").is_empty(),
+            "{}",
+            run.stderr
+        );
     }
 
     // Another place, with other things in it.
@@ -624,16 +628,16 @@ fn captures_that_a_scene_does_not_know_are_told() {
         instances[0]["label"] = "grey dog".into();
     });
     let run = cif(path, "eval table.cif other").succeeds();
-    let warnings = told(&run, "warning:").join("\n");
+    let warnings = messages(&run, "warning:").join("\n");
     for word in ["1 of 1 views", "`table`", "3 is grey dog in the masks and red ball in the scene"] {
         assert!(warnings.contains(word), "{word} in {}", run.stderr);
     }
     let run = cif(path, "render table.cif --capture other -o out").succeeds();
-    assert!(told(&run, "warning:").join("\n").contains("1 of 1 views"), "{}", run.stderr);
+    assert!(messages(&run, "warning:").join("\n").contains("1 of 1 views"), "{}", run.stderr);
 }
 
 #[test]
-fn points_behind_all_cameras_are_told() {
+fn points_behind_all_cameras_are_reported() {
     let folder = with_capture();
     let path = folder.path();
     let info = cif(path, "info table").succeeds().stdout;
@@ -668,7 +672,7 @@ fn captures_are_refused_with_a_reason_and_nothing_is_written() {
     fs::create_dir(folder.path().join("taken")).unwrap();
     fs::write(folder.path().join("taken/x"), b"x").unwrap();
     fs::write(folder.path().join("notes.txt"), b"x").unwrap();
-    for (line, told) in [
+    for (line, message) in [
         ("capture photos -o new", "2 usable images are too few"),
         ("capture none.mp4 -o new", "no such file or folder"),
         ("capture photos -o taken", "taken exists"),
@@ -676,7 +680,7 @@ fn captures_are_refused_with_a_reason_and_nothing_is_written() {
         ("capture photos -o new --masks none", "no such folder of masks"),
         ("capture photos -o new --poses notes.txt", "no poses of a tool that is known"),
     ] {
-        cif(folder.path(), line).fails(1, &[told]);
+        cif(folder.path(), line).fails(1, &[message]);
     }
     for k in 0..4 {
         image(&format!("c{k}.png"), 64, 48, 4 * k);
@@ -717,10 +721,10 @@ fn poses_of_other_tools_become_a_capture_with_times() {
     fs::write(folder.path().join("times.csv"), times).unwrap();
     let line = "capture photos -o table --poses poses.json --times times.csv";
     let made = cif(folder.path(), line).succeeds();
-    for told in
+    for expected in
         ["4 of 4 images", "+z is up", "metre is not known", "cif masks propagate table", "cif train table"]
     {
-        assert!(made.stdout.contains(told), "{told}: {}", made.stdout);
+        assert!(made.stdout.contains(expected), "{expected}: {}", made.stdout);
     }
     let info = cif(folder.path(), "info table").succeeds();
     assert!(info.stdout.contains("does not know the metre"), "{}", info.stdout);

@@ -27,8 +27,8 @@ fn scenes_of_every_head_can_be_scored_drawn_searched_and_exported() {
         let line =
             format!("train table -o {head}.cif --from base.cif --head {head} --iterations-instance 25");
         cif(path, &line).succeeds();
-        let told = cif(path, &format!("eval {head}.cif table --json {head}.json")).succeeds().stdout;
-        assert!(told.contains(&format!("labels as the head {head} decodes every pixel")), "{told}");
+        let stdout = cif(path, &format!("eval {head}.cif table --json {head}.json")).succeeds().stdout;
+        assert!(stdout.contains(&format!("labels as the head {head} decodes every pixel")), "{stdout}");
         let scores = json_file(&path.join(format!("{head}.json")));
         assert_eq!(scores["labels_by"], head);
         assert!(scores["macc_pix"].is_number() && scores["psnr"].is_number(), "{head}: {scores:#}");
@@ -36,8 +36,8 @@ fn scenes_of_every_head_can_be_scored_drawn_searched_and_exported() {
         cif(path, &format!("query {head}.cif --label * --json")).succeeds();
         cif(path, &format!("export {head}.cif --gltf {head}.glb")).succeeds();
     }
-    let told = cif(path, "eval base.cif table --json base.json").succeeds().stdout;
-    assert!(!told.contains("decodes every pixel"), "{told}");
+    let stdout = cif(path, "eval base.cif table --json base.json").succeeds().stdout;
+    assert!(!stdout.contains("decodes every pixel"), "{stdout}");
     assert_eq!(json_file(&path.join("base.json"))["labels_by"], "identity rows");
     cif(path, "train table -o x.cif --from base.cif --head lerf").fails(2, &["--head", "gaussian-grouping"]);
     cif(path, "train table -o x.cif --from base.cif --head sa4d --set head.camera=cam16")
@@ -51,8 +51,8 @@ fn a_comparison_has_the_scores_of_its_scenes_and_goes_on_where_it_stopped() {
     let line = format!(
         "bench compare table -o out --heads cif,dr-splat,vlgs --seeds 1 --iterations 8 --ablations {SMALL_MODEL} {SHORT}"
     );
-    let told = cif(path, &line).succeeds();
-    assert!(told.stdout.contains("VLGS (re-implementation)"), "{}", told.stdout);
+    let output = cif(path, &line).succeeds();
+    assert!(output.stdout.contains("VLGS (re-implementation)"), "{}", output.stdout);
     let rows = json_file(&path.join("out/panoptic.json"));
     let rows = rows.as_array().unwrap();
     let named: Vec<(&str, u64)> =
@@ -88,12 +88,12 @@ fn a_comparison_has_the_scores_of_its_scenes_and_goes_on_where_it_stopped() {
 
     // Everything is kept but what is gone, which needs the reconstruction again.
     fs::remove_file(path.join("out/runs/table.seed0.vlgs.json")).unwrap();
-    let told = cif(path, &line).succeeds().stderr;
-    assert_eq!(told.matches(": kept, ").count(), 6, "{told}");
+    let stderr = cif(path, &line).succeeds().stderr;
+    assert_eq!(stderr.matches(": kept, ").count(), 6, "{stderr}");
     assert_eq!(fs::read(path.join("out/runs/table.seed0.base.cif")).unwrap(), base);
     assert_eq!(json_file(&path.join("out/panoptic.json"))[1]["miou"], rows[1]["miou"], "the same run again");
-    let told = cif(path, &line.replace("--iterations 8", "--iterations 9")).succeeds().stderr;
-    assert_eq!(told.matches(": kept, ").count(), 0, "{told}");
+    let stderr = cif(path, &line.replace("--iterations 8", "--iterations 9")).succeeds().stderr;
+    assert_eq!(stderr.matches(": kept, ").count(), 0, "{stderr}");
 
     // Held-out frames have masks in the folder alone that scores are taken on.
     fs::create_dir(path.join("table/masks_rough")).unwrap();
@@ -128,28 +128,28 @@ fn a_comparison_out_of_time_tells_what_is_missing_and_goes_on() {
         )
     };
     // Nothing begins, not even the reconstruction.
-    let told = cif(path, &line("cif", "--budget 0s")).succeeds();
-    assert!(told.stderr.contains("again for the 2 runs"), "{}", told.stderr);
+    let output = cif(path, &line("cif", "--budget 0s")).succeeds();
+    assert!(output.stderr.contains("again for the 2 runs"), "{}", output.stderr);
     assert!(
-        told.stdout.contains("Missing, and not in the means: table with CIF (seed 0, 1)"),
+        output.stdout.contains("Missing, and not in the means: table with CIF (seed 0, 1)"),
         "{}",
-        told.stdout
+        output.stdout
     );
     assert_eq!(fs::read_dir(path.join("out/runs")).unwrap().count(), 0);
     assert!(
         !cif(path, &line("cif", "--budget 1h")).succeeds().stdout.contains("Missing, and not in the means")
     );
-    // What is there is kept and told; what is not is named.
-    let told = cif(path, &line("cif,dr-splat", "--budget 0s")).succeeds();
-    assert_eq!(told.stderr.matches(": kept, ").count(), 2, "{}", told.stderr);
-    assert!(told.stdout.contains("table with Dr. Splat (seed 0, 1)"), "{}", told.stdout);
+    // Finished runs are kept and reported; missing ones are named.
+    let output = cif(path, &line("cif,dr-splat", "--budget 0s")).succeeds();
+    assert_eq!(output.stderr.matches(": kept, ").count(), 2, "{}", output.stderr);
+    assert!(output.stdout.contains("table with Dr. Splat (seed 0, 1)"), "{}", output.stdout);
     for file in ["panoptic.tex", "compare.html"] {
         let text = fs::read_to_string(path.join("out").join(file)).unwrap();
         assert!(text.contains("Dr. Splat (seed 0, 1)"), "{file}");
     }
-    let told = cif(path, &line("cif,dr-splat", "")).succeeds();
-    assert_eq!(told.stderr.matches(": kept, ").count(), 2, "{}", told.stderr);
-    assert!(!told.stdout.contains("Missing, and not in the means"), "{}", told.stdout);
+    let output = cif(path, &line("cif,dr-splat", "")).succeeds();
+    assert_eq!(output.stderr.matches(": kept, ").count(), 2, "{}", output.stderr);
+    assert!(!output.stdout.contains("Missing, and not in the means"), "{}", output.stdout);
     cif(path, &line("cif", "--budget soon")).fails(2, &["--budget"]);
 }
 
@@ -161,7 +161,7 @@ fn a_comparison_has_a_video_of_its_runs() {
         "bench compare table -o out --heads cif,vlgs --seeds 1 --iterations 4 --video {SMALL_MODEL} {SHORT}"
     );
     let encoders = std::process::Command::new("ffmpeg").arg("-encoders").output();
-    if !encoders.is_ok_and(|told| String::from_utf8_lossy(&told.stdout).contains("libx264")) {
+    if !encoders.is_ok_and(|listed| String::from_utf8_lossy(&listed.stdout).contains("libx264")) {
         cif(path, &line).fails(1, &["--video", "ffmpeg"]);
         eprintln!("skipped: no ffmpeg with libx264");
         return;
@@ -183,10 +183,10 @@ fn a_comparison_has_a_video_of_its_runs() {
         .arg(path.join("out/table.mp4"))
         .output()
         .unwrap();
-    let told = String::from_utf8_lossy(&probed.stdout).trim().to_owned();
-    let numbers: Vec<u32> = told.split(',').map(|number| number.parse().unwrap()).collect();
-    assert!(numbers[0] >= 3 * capture::WIDTH && numbers[1] >= capture::HEIGHT, "{told}: three parts");
-    assert!(numbers[2] >= 61, "{told}: between two held-out frames there are sixty pictures");
+    let size = String::from_utf8_lossy(&probed.stdout).trim().to_owned();
+    let numbers: Vec<u32> = size.split(',').map(|number| number.parse().unwrap()).collect();
+    assert!(numbers[0] >= 3 * capture::WIDTH && numbers[1] >= capture::HEIGHT, "{size}: three parts");
+    assert!(numbers[2] >= 61, "{size}: between two held-out frames there are sixty pictures");
 }
 
 /// Questions about the small capture.
@@ -225,9 +225,9 @@ fn scenes_of_a_comparison_answer_questions_in_words() {
              {SHORT} --queries q.toml {more}"
         )
     };
-    let told = cif(path, &line("")).succeeds();
-    assert!(told.stderr.contains("elsewhere is not compared here"), "{}", told.stderr);
-    assert!(told.stdout.contains("| Dr. Splat | labels | "), "{}", told.stdout);
+    let output = cif(path, &line("")).succeeds();
+    assert!(output.stderr.contains("elsewhere is not compared here"), "{}", output.stderr);
+    assert!(output.stdout.contains("| Dr. Splat | labels | "), "{}", output.stdout);
     let answers = json_file(&path.join("out/queries.json"));
     let answers = answers.as_array().unwrap();
     let named = |answer: &Value| {
@@ -295,15 +295,15 @@ fn scenes_of_a_comparison_answer_questions_in_words() {
     }
 
     // Answers are kept until a question changes; without time nobody is asked.
-    let told = cif(path, &line("")).succeeds().stderr;
-    assert_eq!(told.matches("questions: kept, ").count(), 2, "{told}");
+    let stderr = cif(path, &line("")).succeeds().stderr;
+    assert_eq!(stderr.matches("questions: kept, ").count(), 2, "{stderr}");
     fs::write(path.join("q.toml"), QUESTIONS.replace("steel jug", "steel pot")).unwrap();
-    let told = cif(path, &line("--budget 0s")).succeeds();
-    assert!(told.stderr.contains("questions that 2 scenes have not answered"), "{}", told.stderr);
+    let output = cif(path, &line("--budget 0s")).succeeds();
+    assert!(output.stderr.contains("questions that 2 scenes have not answered"), "{}", output.stderr);
     assert!(
-        told.stdout.contains("Missing, and not in the means: table with CIF (seed 0)"),
+        output.stdout.contains("Missing, and not in the means: table with CIF (seed 0)"),
         "{}",
-        told.stdout
+        output.stdout
     );
     assert_eq!(json_file(&path.join("out/queries.json")), serde_json::json!([]));
 
@@ -340,8 +340,8 @@ fn feature_maps_are_learnt_and_asked() {
         "bench compare table -o out --heads dr-splat,4d-langsplat --seeds 1 --iterations 60 --queries q.toml \
          {SMALL_MODEL} --set stages.coarse=60 --set stages.fine=150 --set densify.max_gaussians=600"
     );
-    let told = cif(path, &line).succeeds();
-    assert!(told.stdout.contains("| 4D LangSplat (time-agnostic) | relevance | "), "{}", told.stdout);
+    let output = cif(path, &line).succeeds();
+    assert!(output.stdout.contains("| 4D LangSplat (time-agnostic) | relevance | "), "{}", output.stdout);
     let answers = json_file(&path.join("out/queries.json"));
     let by: Vec<(&str, &str)> = answers
         .as_array()

@@ -119,7 +119,10 @@ fn times_mean_the_same_in_a_scene_and_in_its_files() {
         );
     }
     let step = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-    assert!(scene.windows(2).any(|pair| step(&pair[0], &pair[1]) > 1e-2), "frames would not be told apart");
+    assert!(
+        scene.windows(2).any(|pair| step(&pair[0], &pair[1]) > 1e-2),
+        "frames could not be distinguished"
+    );
     // Beyond the end the range is named, in frames and seconds.
     for file in ["t.cif", "t.glb"] {
         for line in [format!("query {file} --time 200"), format!("query {file} --interval 20:30")] {

@@ -76,7 +76,7 @@ fn one_and_two_threads_write_the_same_bytes() {
     let reference = scores(one.field(), &dataset);
     for simd in SimdLevel::available() {
         let (psnr, miou) = scores(train(&dataset, 2, simd).field(), &dataset);
-        assert!((psnr - reference.0).abs() < 0.5, "{simd:?}: PSNR {psnr} beside {}", reference.0);
-        assert!((miou - reference.1).abs() < 3.0, "{simd:?}: mIoU {miou} beside {}", reference.1);
+        assert!((psnr - reference.0).abs() < 0.5, "{simd:?}: PSNR {psnr} compared with {}", reference.0);
+        assert!((miou - reference.1).abs() < 3.0, "{simd:?}: mIoU {miou} compared with {}", reference.1);
     }
 }

@@ -156,7 +156,7 @@ fn edits_come_home_and_the_result_does_all_that_a_scene_does() {
     assert_eq!(objects.len(), 2, "{changes:#}");
     assert_eq!((&objects[0]["id"], &objects[1]["kind"]), (&json!(1), &json!("removed")));
     assert!(cif(path, "diff edited.cif edited.cif").succeeds().stdout.contains("no differences"));
-    // An exported file beside the scene that it came from is compared by rows.
+    // An exported file and the scene that it came from are compared by rows.
     assert!(cif(path, "diff base.cif exported.glb").succeeds().stdout.contains("no differences"));
 
     // Recorded motion cannot be trained.
@@ -222,7 +222,7 @@ fn exports_are_checked_against_the_scene() {
     assert!(ply["against_scene"]["miou"].is_null(), "no objects, no IoU: {ply:#}");
     assert!(gltf["held_out"].is_null() && number(&gltf["seconds"]) > 0.0);
 
-    // One that stands still, or holds another time than is asked for, is told.
+    // One that stands still, or holds another time than is asked for, is reported.
     let still = &check("--gltf still.glb --motion static --check-views 2")[0]["against_scene"];
     assert_eq!(still["views"], json!(2));
     assert!(number(&still["psnr"]) < number(&scene["psnr"]) - 3.0, "{still:#}");
@@ -230,8 +230,8 @@ fn exports_are_checked_against_the_scene() {
     assert_eq!(part["views"], json!(1));
     assert!(part["psnr"].as_f64().is_none_or(|psnr| psnr > 40.0), "{part:#}");
 
-    let told = cif(path, "export base.cif --gltf told.glb --check").succeeds().stdout;
-    assert!(told.contains("told.glb read back in") && told.contains("cereal box"), "{told}");
+    let stdout = cif(path, "export base.cif --gltf reported.glb --check").succeeds().stdout;
+    assert!(stdout.contains("reported.glb read back in") && stdout.contains("cereal box"), "{stdout}");
     cif(path, "export base.cif --report --check").fails(2, &["--check", "--gltf"]);
     cif(path, "export base.cif --ply all --ply-split --check").fails(2, &["--ply-split"]);
     cif(path, "export base.cif --gltf a.glb --capture .").fails(2, &["--check"]);

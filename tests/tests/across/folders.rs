@@ -146,13 +146,13 @@ fn folders_without_permission_are_refused_and_results_in_them_stay() {
     fs::set_permissions(&shut, fs::Permissions::from_mode(0o555)).unwrap();
     for line in WRITERS {
         let started = binding[1..].iter().map(|word| (*word).to_owned()).chain([CIF.to_owned()]);
-        let told = run(binding[0], path, started.chain(words(line)));
-        refused(&told, line, "shut");
-        assert!(told.stderr.contains("Permission denied"), "{line}: {}", told.stderr);
+        let output = run(binding[0], path, started.chain(words(line)));
+        refused(&output, line, "shut");
+        assert!(output.stderr.contains("Permission denied"), "{line}: {}", output.stderr);
         assert!(
-            !told.stderr.contains("nowhere"),
+            !output.stderr.contains("nowhere"),
             "{line} is refused before its input is looked at: {}",
-            told.stderr
+            output.stderr
         );
     }
     fs::set_permissions(&shut, fs::Permissions::from_mode(0o755)).unwrap();
@@ -209,9 +209,9 @@ fn full_disks_are_one_error_and_results_on_them_stay() {
     // Those of which the work is done all the same are tried with an end: the disk may have been full only then.
     for line in WRITERS.iter().filter(|line| !line.contains("nowhere")) {
         let line = line.replace("shut", "full");
-        let told = cif(path, &line);
-        refused(&told, &line, "full");
-        assert!(told.stderr.contains("No space left"), "{line}: {}", told.stderr);
+        let output = cif(path, &line);
+        refused(&output, &line, "full");
+        assert!(output.stderr.contains("No space left"), "{line}: {}", output.stderr);
     }
     assert!(contents(&shut) == before, "{:?}", contents(&shut).keys());
 }

@@ -100,28 +100,28 @@ fn a_gpu_renders_what_the_processor_renders() {
     // A draft leaves the same out on both, and keeps colours in 16 bits on the GPU.
     for backend in ["cpu", "wgpu"] {
         let line = "render scene.cif --camera views.json --quality draft --backend";
-        let told = cif(path, &format!("{line} {backend} -o draft_{backend}")).succeeds().stderr;
-        assert!(told.contains("draft: PSNR"), "{told}");
+        let stderr = cif(path, &format!("{line} {backend} -o draft_{backend}")).succeeds().stderr;
+        assert!(stderr.contains("draft: PSNR"), "{stderr}");
     }
     let [a, b] = ["draft_cpu", "draft_wgpu"]
         .map(|name| image::open(path.join(name).join("rgb/a.png")).unwrap().into_rgb8().into_raw());
     let far = a.iter().zip(&b).filter(|(a, b)| a.abs_diff(**b) > 1).count();
     assert!(far * 50 < a.len(), "{far} of {} values differ", a.len());
     let software = facts["adapters"][0]["software"].as_bool().unwrap();
-    let told = cif(path, "render scene.cif --camera views.json -o auto").succeeds().stderr;
-    assert!(told.contains(if software { "software" } else { "a view" }), "{told}");
+    let stderr = cif(path, "render scene.cif --camera views.json -o auto").succeeds().stderr;
+    assert!(stderr.contains(if software { "software" } else { "a view" }), "{stderr}");
     cif(path, "render scene.cif --camera views.json --exr --backend wgpu -o exr").fails(2, &["EXR"]);
 }
 
 #[test]
-fn a_step_is_told_by_stage_beside_its_floor_and_the_processor() {
+fn a_step_is_reported_by_stage_with_its_floor_and_the_processor() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path();
     let Some(facts) = gpu(path) else { return };
     cif_test::capture::write(&path.join("table"), 4);
     let line = "bench step table --backend wgpu --steps 2 --warm-up 1 --set model.spatial_resolution=[8,8,8]";
-    let told = cif(path, &format!("{line} --json -")).succeeds().stdout;
-    let report: Value = serde_json::from_str(&told).expect("JSON on stdout");
+    let stdout = cif(path, &format!("{line} --json -")).succeeds().stdout;
+    let report: Value = serde_json::from_str(&stdout).expect("JSON on stdout");
     let device = &report["device"];
     for key in ["bytes_per_second", "flops_per_second", "step_ms", "processor_step_ms"] {
         assert!(device[key].as_f64().unwrap_or_default() > 0.0, "{key}: {device:#}");
@@ -166,7 +166,7 @@ fn memory_does_not_grow_with_the_steps() {
         events.filter_map(|event| event["peak_rss_mb"].as_f64()).next_back()
     };
     let Some((few, many)) = peak_mb(40).zip(peak_mb(190)) else {
-        eprintln!("skipped: this system does not tell how much memory a process takes");
+        eprintln!("skipped: this system does not report how much memory a process takes");
         return;
     };
     // A megabyte that each of 150 more steps keeps would show.
@@ -174,7 +174,7 @@ fn memory_does_not_grow_with_the_steps() {
 }
 
 #[test]
-fn features_that_are_held_back_change_no_picture_and_are_told() {
+fn features_that_are_held_back_change_no_picture_and_are_reported() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path();
     let Some(facts) = gpu(path) else { return };

@@ -22,14 +22,14 @@ fn hard_captures_end_with_a_finite_scene() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path();
     capture::write(&path.join("table"), 13);
-    // Whether a change matters shows only in longer runs: here a difference may be told, a failure may not.
-    let told = cif(path, &format!("bench hardness table -o hard {SHORT}"));
+    // Whether a change matters shows only in longer runs: here a difference may be reported, a failure may not.
+    let output = cif(path, &format!("bench hardness table -o hard {SHORT}"));
     let report: Value =
         serde_json::from_str(&fs::read_to_string(path.join("hard/report.json")).unwrap()).unwrap();
     let rows = report["variants"].as_array().unwrap();
     assert!(rows.len() >= 9, "{report:#}");
     for row in rows {
-        assert_ne!(row["verdict"], "failed", "{row:#}\n{}", told.stderr);
+        assert_ne!(row["verdict"], "failed", "{row:#}\n{}", output.stderr);
         assert!(row["psnr"].as_f64().is_some_and(f64::is_finite), "{row:#}");
         assert_eq!(row["rolled_back"], 0, "{row:#}");
     }
@@ -68,14 +68,14 @@ fn a_capture_far_away_trains_and_renders_as_it_is_read() {
     fs::write(path.join("far/points.npy"), moved).unwrap();
 
     let tiny = "--iterations-coarse 6 --iterations-fine 8 --iterations-instance 6 -q";
-    let told = cif(path, &format!("train far -o far.cif {tiny}")).succeeds();
-    assert!(told.stderr.contains("in a frame of its own"), "{}", told.stderr);
+    let output = cif(path, &format!("train far -o far.cif {tiny}")).succeeds();
+    assert!(output.stderr.contains("in a frame of its own"), "{}", output.stderr);
     let facts: Value = serde_json::from_str(&cif(path, "info far.cif --json").succeeds().stdout).unwrap();
     let offset = &facts["provenance"]["dataset"]["frame"]["offset"];
     assert!((offset[2].as_f64().unwrap() - 30_001.1).abs() < 1.0, "{facts:#}");
     assert!(facts["box"]["to"][0].as_f64().unwrap().abs() < 10.0, "{facts:#}");
-    let told = cif(path, "export far.cif --gltf far.glb").succeeds().stderr;
-    assert!(told.contains("in a frame of its own"), "{told}");
+    let stderr = cif(path, "export far.cif --gltf far.glb").succeeds().stderr;
+    assert!(stderr.contains("in a frame of its own"), "{stderr}");
     // Commands that open the capture again read it in the same frame.
     let scores = cif(path, "eval far.cif far --json -").succeeds().stdout;
     let scores: Value = serde_json::from_str(&scores).unwrap();

@@ -28,8 +28,8 @@ fn every_row_names_tests_that_exist() {
         assert_eq!(cells.len(), 8, "row {number} has eight columns: {line}");
         assert!(rows.insert(number, tests_of(line)).is_none(), "row {number} is there twice");
         for worst in &cells[4..] {
-            let is_told = !worst.is_empty() && *worst != "?";
-            assert!(is_told, "row {number} tells no worst error; see how the table is made");
+            let is_stated = !worst.is_empty() && *worst != "?";
+            assert!(is_stated, "row {number} states no worst error; see how the table is made");
         }
     }
     assert_eq!(rows.keys().copied().collect::<Vec<_>>(), (1..=ROWS).collect::<Vec<_>>());

@@ -133,8 +133,8 @@ fn a_scene_shows_and_tells_its_objects() {
     cif(path, "query scene.cif --taxonomy coco=ball").fails(1, &["ball"]);
     cif(path, "query scene.cif --taxonomy wikidata_qcode=Q18545 --label ball").fails(2, &["--label"]);
     for file in ["table", "scene.cif"] {
-        let told = cif(path, &format!("info {file}")).succeeds().stdout;
-        assert!(told.contains("wikidata_qcode Q18545"), "{told}");
+        let stdout = cif(path, &format!("info {file}")).succeeds().stdout;
+        assert!(stdout.contains("wikidata_qcode Q18545"), "{stdout}");
     }
 
     // By masks of a detector.

@@ -37,8 +37,8 @@ fn pictures_have_the_exposure_of_their_camera_where_they_are_to() {
     let brightness = |look: &str| -> f64 {
         let line =
             ["render", "scene.cif", "--capture", CAPTURE, "--backend", "cpu", "--look", look, "-o", look];
-        let (succeeded, told) = cif(path, &line);
-        assert!(succeeded, "{told}");
+        let (succeeded, message) = cif(path, &line);
+        assert!(succeeded, "{message}");
         let folder = path.join(look).join("rgb");
         let pictures =
             std::fs::read_dir(folder).expect("pictures").map(|entry| entry.expect("an entry").path());
@@ -52,15 +52,15 @@ fn pictures_have_the_exposure_of_their_camera_where_they_are_to() {
     field.record.drawing.exposures_in_time = [("elsewhere".to_owned(), series)].into();
     field.save(path.join("others.cif")).expect("the folder can be written");
     let line = ["render", "others.cif", "--capture", CAPTURE, "--look", "recorded", "-o", "others"];
-    let (succeeded, told) = cif(path, &line);
-    assert!(succeeded && told.contains("views have the mean look"), "{told}");
+    let (succeeded, message) = cif(path, &line);
+    assert!(succeeded && message.contains("views have the mean look"), "{message}");
     for (scene, views, why) in [
         ("plain.cif", ["--capture", CAPTURE], "learnt no exposures"),
         ("scene.cif", ["--camera", "views.json"], "--look recorded is that of a camera of a capture"),
     ] {
         let line = ["render", scene, views[0], views[1], "--look", "recorded", "-o", "refused"];
-        let (succeeded, told) = cif(path, &line);
-        assert!(!succeeded && told.contains(why), "{told}");
+        let (succeeded, message) = cif(path, &line);
+        assert!(!succeeded && message.contains(why), "{message}");
         assert!(!path.join("refused").exists());
     }
 }

@@ -74,7 +74,7 @@ fn depths_that_memory_does_not_hold_are_refused_before_they_are_drawn() {
     );
     let output =
         Command::new("sh").args(["-c", &line]).current_dir(folder.path()).output().expect("sh starts");
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert!(told.contains("1.1 GB of memory (16384 x 16384 depths x 4 bytes)"), "{told}");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(stderr.contains("1.1 GB of memory (16384 x 16384 depths x 4 bytes)"), "{stderr}");
     assert!(!folder.path().join("out").exists());
 }

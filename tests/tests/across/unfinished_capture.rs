@@ -23,8 +23,8 @@ fn words(line: &str) -> Vec<String> {
     line.split_whitespace().map(str::to_owned).collect()
 }
 
-/// The command that is told below a line with these words, without the name of the program.
-fn told(run: &Run, heading: &str) -> Vec<String> {
+/// The command that is printed below a line with these words, without the name of the program.
+fn command_of(run: &Run, heading: &str) -> Vec<String> {
     let mut lines = run.stderr.lines().skip_while(|line| !line.contains(heading));
     let line = lines.nth(1).expect("a command below the heading");
     // Words of this test are quoted for shells, but have no blanks.
@@ -90,10 +90,10 @@ fn frames_and_poses_that_are_not_believed_are_kept_for_the_next_command() {
     assert!(!path.join("new").exists());
     fs::remove_file(path.join("walk.mkv")).unwrap();
 
-    // Without the video: the same images in the same order, and poses kept beside the first.
+    // Without the video: the same images in the same order, and poses kept next to the first.
     let job = |name: &str| serde_json::from_slice::<Value>(&fs::read(path.join(name)).unwrap()).unwrap();
     let before = job("job.json");
-    let again = told(&first, "with other options");
+    let again = command_of(&first, "with other options");
     for expected in ["--order", "--focal", "--up", "walk=new-unfinished/images"] {
         assert!(again.iter().any(|word| word == expected), "{expected}: {again:?}");
     }
@@ -103,10 +103,10 @@ fn frames_and_poses_that_are_not_believed_are_kept_for_the_next_command() {
         assert_eq!(job("job.json")[key], before[key], "{key}");
     }
 
-    let accepted = cif(path, &told(&second, "all the same")).succeeds();
+    let accepted = cif(path, &command_of(&second, "all the same")).succeeds();
     assert!(accepted.stdout.contains("14 of 14 images of 1 cameras have a pose"), "{}", accepted.stdout);
     assert!(accepted.stdout.contains("times: of every image"), "{}", accepted.stdout);
     let written = job("new/transforms.json");
     assert_eq!(written["frames"][3]["time"], 0.3);
-    assert_eq!(written["cif"]["up_known"], true, "--up is told again");
+    assert_eq!(written["cif"]["up_known"], true, "--up is given again");
 }

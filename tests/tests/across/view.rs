@@ -180,8 +180,8 @@ fn scenes_are_compared_with_their_captures_alone() {
             .current_dir(folder.path())
             .output()
             .expect("the command starts");
-        let told = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert!(!output.status.success() && told.contains(why), "{told}");
+        let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!output.status.success() && stderr.contains(why), "{stderr}");
     };
     refused(&["view", CAPTURE, "--capture", CAPTURE, "--no-open"], "compares with a scene");
     refused(&["view", "nothing.cif", "--no-open"], "nothing.cif");
@@ -260,8 +260,8 @@ fn films_are_made_of_views_by_ffmpeg() {
     ] {
         let line =
             ["render", "scene.cif", "--camera", "views.json", "--what", what, "--fps", fps, "-o", output];
-        let (succeeded, told) = run(&line);
-        assert!(!succeeded && told.contains(why), "{told}");
+        let (succeeded, message) = run(&line);
+        assert!(!succeeded && message.contains(why), "{message}");
         assert!(!folder.path().join(output).exists());
     }
     if Command::new("ffmpeg").arg("-version").output().is_err() {
@@ -270,10 +270,10 @@ fn films_are_made_of_views_by_ffmpeg() {
     }
     for film in ["a.mp4", "a.gif", "a.webm"] {
         let line = ["render", "scene.cif", "--camera", "views.json", "--backend", "cpu", "-o", film];
-        let (succeeded, told) = run(&line);
-        assert!(succeeded, "{told}");
-        let (succeeded, told) = run(&line);
-        assert!(!succeeded && told.contains("--force"), "{told}");
+        let (succeeded, message) = run(&line);
+        assert!(succeeded, "{message}");
+        let (succeeded, message) = run(&line);
+        assert!(!succeeded && message.contains("--force"), "{message}");
     }
     let decoded = folder.path().join("frame.png");
     let status = Command::new("ffmpeg")

@@ -141,7 +141,7 @@ fn tensors_that_are_missing_or_do_not_fit_are_named() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path();
     let picture = Picture::filled(16, 12, [9, 9, 9]);
-    let told = |words: &[&str]| {
+    let refused_with = |words: &[&str]| {
         let problem = ask(path, &picture, "red ball").unwrap_err();
         assert!(words.iter().all(|word| problem.contains(word)), "{words:?} in: {problem}");
     };
@@ -176,7 +176,7 @@ fn tensors_that_are_missing_or_do_not_fit_are_named() {
         let manifest = models::MANIFEST.replacen(old, new, 1);
         assert_ne!(manifest, models::MANIFEST, "{old}");
         fs::write(path.join("models.toml"), manifest).unwrap();
-        told(&words);
+        refused_with(&words);
     }
 
     // Types and shapes of the models themselves.
@@ -203,11 +203,11 @@ fn tensors_that_are_missing_or_do_not_fit_are_named() {
         .replace(r#"logits = "logits", boxes = "pred_boxes""#, r#"logits = "l", boxes = "b""#);
     fs::write(path.join("models.toml"), manifest).unwrap();
     fs::write(path.join("boxes.onnx"), scores(Element::Double, &[1, 3, -1, -1])).unwrap();
-    told(&["`pixel_values`", "of type f64"]);
+    refused_with(&["`pixel_values`", "of type f64"]);
     fs::write(path.join("boxes.onnx"), scores(Element::Float, &[-1, 3])).unwrap();
-    told(&["`pixel_values`", "[?, 3]", "4 axes"]);
+    refused_with(&["`pixel_values`", "[?, 3]", "4 axes"]);
     fs::write(path.join("boxes.onnx"), scores(Element::Float, &[1, 3, 100, 200])).unwrap();
-    told(&["`pixel_values`", "[1, 3, 100, 200]", "[1, 3, 800, 1066]"]);
+    refused_with(&["`pixel_values`", "[1, 3, 100, 200]", "[1, 3, 800, 1066]"]);
     fs::write(path.join("boxes.onnx"), scores(Element::Float, &[1, 3, -1, -1])).unwrap();
     assert_eq!(ask(path, &picture, "red").unwrap().1.len(), 1);
 }
@@ -260,7 +260,7 @@ fn a_scene_is_asked_in_words() {
     assert_eq!(blue["boxes"].as_object().unwrap().len(), 16);
     assert_eq!(blue["boxes"]["000003"][0]["words"], "blue");
 
-    // Masks are kept beside the capture, which is read as before; broken ones are made anew.
+    // Masks are kept next to the capture, which is read as before; broken ones are made anew.
     let kept = || -> Vec<_> {
         let prompt = fs::read_dir(path.join("table/.cif-cache")).unwrap().map(|entry| entry.unwrap().path());
         let mut files: Vec<_> =
@@ -304,8 +304,8 @@ fn a_scene_is_asked_in_words() {
     ask(&["--prompt", "blue ball", "--protocol", "grouping"]).succeeds();
     assert_eq!((kept().len(), folders("table/.cif-cache")), (17, 2));
     let nothing = ["--prompt", "teapot", "--protocol", "grouping", "--cache", "elsewhere"];
-    let told = cif(path, &[&question[..6], &nothing].concat()).succeeds().stdout;
-    assert!(told.contains("in 0 of 1 pictures") && told.contains("no instance"), "{told}");
+    let stdout = cif(path, &[&question[..6], &nothing].concat()).succeeds().stdout;
+    assert!(stdout.contains("in 0 of 1 pictures") && stdout.contains("no instance"), "{stdout}");
     assert_eq!((kept().len(), folders("elsewhere")), (17, 1));
     #[cfg(unix)]
     {
@@ -351,8 +351,8 @@ fn a_scene_is_asked_in_words() {
     );
     without.fails(1, &["no object", "blue ball"]);
     let embed = ["embed", "scene.cif", "--capture", "table", "--models", "models", "-o", "seen.cif"];
-    let told = cif(path, &embed).succeeds().stdout;
-    assert!(told.contains("red ball") && told.contains("embeddings by colours"), "{told}");
+    let stdout = cif(path, &embed).succeeds().stdout;
+    assert!(stdout.contains("red ball") && stdout.contains("embeddings by colours"), "{stdout}");
     cif(path, &embed).fails(1, &["seen.cif exists"]);
     cif(path, &["export", "seen.cif", "--gltf", "seen.glb"]).succeeds();
     cif(path, &["import", "seen.glb", "-o", "back.cif"]).succeeds();
@@ -399,9 +399,9 @@ fn a_scene_is_asked_in_words() {
     let prompt = ["query", "scene.cif", "--capture", "table", "--prompt", "blue ball", "--cache", "new"];
     let text = ["query", "seen.cif", "--text", "blue ball"];
     for asked in [&prompt[..], &text] {
-        let told = cif(path, &[asked, &["--models", "models"]].concat());
-        assert!(!told.stderr.contains("panicked"), "{}", told.stderr);
-        told.fails(1, &["words.json", "ended the process that ran it", "101"]);
+        let output = cif(path, &[asked, &["--models", "models"]].concat());
+        assert!(!output.stderr.contains("panicked"), "{}", output.stderr);
+        output.fails(1, &["words.json", "ended the process that ran it", "101"]);
     }
     // A file that is no library does not hold the command up.
     let library = format!("ORT_DYLIB_PATH={}", words.display());
@@ -440,14 +440,14 @@ fn a_model_that_ends_the_runtime_is_one_error_that_names_it() {
     if ending_runtime(&path.join("model.so"), &[]).is_none() {
         return;
     }
-    let told = ask("model.so");
-    assert_eq!(told.stderr.matches("Error").count(), 1, "{}", told.stderr);
-    told.fails(1, &["models/picture.onnx cannot be loaded", "ended the process that ran it", "SIGABRT"]);
+    let output = ask("model.so");
+    assert_eq!(output.stderr.matches("Error").count(), 1, "{}", output.stderr);
+    output.fails(1, &["models/picture.onnx cannot be loaded", "ended the process that ran it", "SIGABRT"]);
     // One that ends with the library itself is not blamed on the model.
     ending_runtime(&path.join("library.so"), &["-DENDS_AT_ONCE"]);
-    let told = ask("library.so");
-    assert!(!told.stderr.contains("picture.onnx"), "{}", told.stderr);
-    told.fails(1, &["library.so is no library of ONNX Runtime that fits", "ended the process", "SIGABRT"]);
+    let output = ask("library.so");
+    assert!(!output.stderr.contains("picture.onnx"), "{}", output.stderr);
+    output.fails(1, &["library.so is no library of ONNX Runtime that fits", "ended the process", "SIGABRT"]);
 }
 
 #[test]
@@ -479,8 +479,12 @@ fn scenes_of_a_comparison_are_asked_by_both_protocols() {
     let line = format!(
         "bench compare table -o out --heads cif --seeds 1 --iterations 60 --queries q.json --models models {settings}"
     );
-    let told = run(CIF, path, line.split_whitespace()).succeeds();
-    assert!(told.stdout.contains("Grounding DINO") && !told.stdout.contains("No models"), "{}", told.stdout);
+    let output = run(CIF, path, line.split_whitespace()).succeeds();
+    assert!(
+        output.stdout.contains("Grounding DINO") && !output.stdout.contains("No models"),
+        "{}",
+        output.stdout
+    );
     assert!(path.join("table/.cif-cache").is_dir(), "masks are kept for the next question");
     let answers = json(&fs::read_to_string(path.join("out/queries.json")).unwrap());
     let answers = answers.as_array().unwrap();
@@ -506,6 +510,6 @@ fn scenes_of_a_comparison_are_asked_by_both_protocols() {
     }
     let page = fs::read_to_string(path.join("out/compare.html")).unwrap();
     assert!(page.contains("<td>grouping</td>") && page.contains("<td>reproject</td>"));
-    let told = run(CIF, path, line.split_whitespace()).succeeds().stderr;
-    assert_eq!(told.matches("questions: kept, ").count(), 1, "{told}");
+    let stderr = run(CIF, path, line.split_whitespace()).succeeds().stderr;
+    assert_eq!(stderr.matches("questions: kept, ").count(), 1, "{stderr}");
 }

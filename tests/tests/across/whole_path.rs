@@ -127,11 +127,11 @@ fn a_capture_becomes_a_scene_that_is_scored_rendered_and_queried() {
     let facts = json(&cif(path, "info scene.cif --json").succeeds().stdout);
     let motion = &facts["instances"][0]["motion"];
     assert_eq!(motion["model"], "rigid", "{facts:#}");
-    let way = capture::centre(capture::ROLLING, 1.0) - capture::centre(capture::ROLLING, 0.0);
+    let displacement = capture::centre(capture::ROLLING, 1.0) - capture::centre(capture::ROLLING, 0.0);
     let moves = motion["moves"].as_f64().unwrap();
-    assert!((moves / way.length() - 1.0).abs() < 0.15, "{moves} m for {} m", way.length());
+    assert!((moves / displacement.length() - 1.0).abs() < 0.15, "{moves} m for {} m", displacement.length());
 
-    // What a file loses is told on held-out images, as `cif eval` scores them.
+    // The loss of a file is measured on held-out images, as `cif eval` scores them.
     let line = "export scene.cif --gltf checked.glb --check --capture table --json";
     let checked = &json(&cif(path, line).succeeds().stdout)["check"][0]["held_out"];
     let (before, after) = (&checked["scene"], &checked["file"]);
@@ -164,7 +164,7 @@ fn a_capture_becomes_a_scene_that_is_scored_rendered_and_queried() {
     cif(path, "info short.cif").fails(1, &["short.cif", "cut short"]);
 }
 
-/// What is told to go on with can be pasted into a shell, whatever files are called.
+/// The command that is printed to go on with can be pasted into a shell, whatever files are called.
 #[cfg(unix)]
 #[test]
 fn all_steps_are_one_command_that_stops_where_frames_have_to_be_painted() {
@@ -197,7 +197,7 @@ fn all_steps_are_one_command_that_stops_where_frames_have_to_be_painted() {
     let query = cif(path, "query out/scene.glb --label *").succeeds();
     assert!(query.stdout.contains("red ball") && query.stdout.contains("blue ball"), "{}", query.stdout);
 
-    // What is there is not made again, a run that was interrupted goes on, and what is out of date is told.
+    // What is there is not made again, a run that was interrupted goes on, and what is out of date is reported.
     let again = cif(path, line).succeeds();
     assert!(!again.stderr.contains('$'), "{}", again.stderr);
     fs::remove_file(path.join("out/scene.glb")).unwrap();
@@ -207,10 +207,10 @@ fn all_steps_are_one_command_that_stops_where_frames_have_to_be_painted() {
 
     // What follows from a change is made again, with the reason.
     fs::copy(path.join("truth/000003.png"), path.join("out/keyframes/000003.png")).unwrap();
-    let told = cif(path, &line.replace(" --quiet", "")).succeeds().stderr;
-    assert!(told.contains("out/masks is made again: the keyframe file 000003.png is new"), "{told}");
+    let stderr = cif(path, &line.replace(" --quiet", "")).succeeds().stderr;
+    assert!(stderr.contains("out/masks is made again: the keyframe file 000003.png is new"), "{stderr}");
     for step in ["$ cif masks propagate table", "$ cif export out/scene.cif"] {
-        assert!(told.contains(step), "{step} in {told}");
+        assert!(stderr.contains(step), "{step} in {stderr}");
     }
 }
 
@@ -229,16 +229,22 @@ fn results_of_other_inputs_are_not_passed_off() {
     assert!(!make().contains('$'), "nothing is made again");
     // In place, of the same size: another file's content, which is as long as it is padded to.
     fs::write(path.join("tiny.toml"), settings.replace("coarse = 3", "coarse = 4")).unwrap();
-    let told = make();
-    assert!(told.contains("out/scene.cif is made again: the settings file has changed"), "{told}");
-    assert!(told.contains("$ cif train table") && told.contains("$ cif export out/scene.cif"), "{told}");
+    let stderr = make();
+    assert!(stderr.contains("out/scene.cif is made again: the settings file has changed"), "{stderr}");
+    assert!(
+        stderr.contains("$ cif train table") && stderr.contains("$ cif export out/scene.cif"),
+        "{stderr}"
+    );
     fs::copy(path.join("table/masks/000001.png"), path.join("table/masks/000000.png")).unwrap();
-    let told = make();
-    assert!(told.contains("out/scene.cif is made again: the mask of frame 000000 has changed"), "{told}");
+    let stderr = make();
+    assert!(stderr.contains("out/scene.cif is made again: the mask of frame 000000 has changed"), "{stderr}");
     // What is made by hand is not replaced, and what follows from it is.
     cif(path, "label out/scene.cif --instance 3 other").succeeds();
-    let told = make();
-    assert!(!told.contains("$ cif train") && told.contains("is made again: the scene has changed"), "{told}");
+    let stderr = make();
+    assert!(
+        !stderr.contains("$ cif train") && stderr.contains("is made again: the scene has changed"),
+        "{stderr}"
+    );
 
     // A run does not go on with other inputs than those it began with.
     let tiny = "--config tiny.toml -q";
@@ -281,7 +287,7 @@ fn the_command_to_go_on_with_can_be_pasted() {
     fs::rename(path.join("table"), path.join("my table")).unwrap();
     let start = ["train", "my table", "-o", "it's $HOME.cif", "--stop-after", "1"];
     let stopped = run(CIF, path, start.into_iter().chain(TINY.split_whitespace())).succeeds();
-    let (_, line) = stopped.stderr.split_once("continue with: cif ").expect("the command is told");
+    let (_, line) = stopped.stderr.split_once("continue with: cif ").expect("the command is printed");
     let script = format!("\"$CIF\" {}", line.lines().next().unwrap());
     let status = std::process::Command::new("sh")
         .args(["-c", &script])
@@ -353,7 +359,7 @@ fn killed_runs_go_on_from_what_was_saved_and_signals_save_first() {
     drop(run);
     let killed_at = steps();
     assert!(killed_at.as_u64() > Some(0), "{killed_at}");
-    // It goes on, says at which step it stands, and saves when it is told to end.
+    // It goes on, says at which step it stands, and saves when it is asked to end.
     let mut run = Background::start(CIF, path, "train table -o a.cif --resume --quiet --log run.jsonl");
     let log = path.join("run.jsonl");
     run.until(|| fs::read_to_string(&log).is_ok_and(|text| text.contains("\"step\"")));
@@ -396,8 +402,9 @@ fn a_reconstruction_of_images_that_have_changed_is_not_begun_with_unasked() {
     picture.put_pixel(0, 0, image::Rgb([1, 2, 3]));
     picture.save(&image).unwrap();
     let line = "train table -o next.cif --from bare.cif";
-    let told = ["bare.cif", "the image of frame 000001 has changed", "without --from", "--accept-changes"];
-    cif(path, line).fails(1, &told);
+    let expected =
+        ["bare.cif", "the image of frame 000001 has changed", "without --from", "--accept-changes"];
+    cif(path, line).fails(1, &expected);
     // Of a scene that was itself begun so.
     cif(path, "train table -o next.cif --from other.cif")
         .fails(1, &["the image of frame 000001 has changed"]);
@@ -515,7 +522,7 @@ fn motion_is_measured_against_followed_points() {
     assert_eq!((&red["within_10_mm"], &red["within_50_mm"]), (&100.0.into(), &100.0.into()));
     // The box of a ball without its outermost splats.
     assert!(number(&red["box_iou"]) > 75.0, "{red:#}");
-    // The recorded poses have no evidence beside them, and the true ball is carried without a turn.
+    // The recorded poses have no evidence with them, and the true ball is carried without a turn.
     assert_eq!((&red["claim"], &rolls["claims"]["none"]["right"]), (&Value::Null, &0.into()));
     let blue = &rolls["instances"][1];
     assert_eq!((&blue["model"], &blue["moves"]), (&"static".into(), &false.into()));
@@ -541,7 +548,7 @@ fn motion_is_measured_against_followed_points() {
         assert!(table.contains(words), "{words} in {table}");
     }
 
-    // Known motion is read, not written; damage is told before anything is rendered.
+    // Known motion is read, not written; damage is reported before anything is rendered.
     cif(path, "eval still.cif table --json table/motion.json --force").fails(2, &["is read by this command"]);
     assert!(motion("eval still.cif table --no-masks --json -").is_null(), "nobody knows what is seen");
     let tracks = path.join("table/tracks.npz");

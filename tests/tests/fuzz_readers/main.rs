@@ -119,7 +119,7 @@ impl Bench {
     }
 }
 
-/// A way in which a reader failed.
+/// A failure of a reader.
 struct Failure {
     reader: &'static str,
     problem: String,
@@ -238,9 +238,9 @@ fn readers_take_damaged_files_or_name_them() {
     }
     benches.iter().for_each(Bench::clear);
     println!("{count} damaged files for {} readers", benches.len());
-    let told: Vec<String> =
+    let reported: Vec<String> =
         failures.iter().map(|failure| format!("{}: {}", failure.case, failure.problem)).collect();
-    assert!(told.is_empty(), "{} kinds of failures:\n{}", told.len(), told.join("\n"));
+    assert!(reported.is_empty(), "{} kinds of failures:\n{}", reported.len(), reported.join("\n"));
 }
 
 /// Inputs that a reader once failed on.

@@ -267,7 +267,7 @@ pub(crate) fn all() -> Vec<Reader> {
                 cif_vision::cache::write(&folder.join("mask.png"), &mask, &[found]).unwrap();
             },
             read: |folder| {
-                // A broken one is made anew, and nobody told.
+                // A broken one is made anew, without a message.
                 drop(cif_vision::cache::boxes(&folder.join("mask.png"), (8, 6)));
                 Ok(())
             },
@@ -480,7 +480,7 @@ fn gltf(folder: &Path, name: &str) {
     cif_gltf::export(&graph(), &folder.join(name), cif_gltf::ExportOptions::default()).unwrap();
 }
 
-/// A run that was interrupted before its first step, and the capture beside it.
+/// A run that was interrupted before its first step, and the capture next to it.
 fn training_state(folder: &Path) {
     capture::write(&folder.join("capture"), 4);
     let dataset = Dataset::open(folder.join("capture"), &OpenOptions::default()).unwrap();

@@ -46,7 +46,7 @@ fn absolute(path: &Path) -> PathBuf {
     path.canonicalize().or_else(|_| std::path::absolute(path)).unwrap_or_else(|_| path.to_owned())
 }
 
-/// The way from a folder to another, both absolute.
+/// The path from a folder to another, both absolute.
 fn relative(from: &Path, to: &Path) -> String {
     let shared = from.components().zip(to.components()).take_while(|(from, to)| from == to).count();
     let up = from.components().skip(shared).map(|_| "..".to_owned());
@@ -108,13 +108,13 @@ mod tests {
 
     #[test]
     fn folders_are_named_from_the_template() {
-        for (from, to, way) in [
+        for (from, to, path) in [
             ("/a/b", "/a/b", "."),
             ("/a/b", "/a/c/d", "../c/d"),
             ("/a", "/a/b", "b"),
             ("/a/b/c", "/a", "../.."),
         ] {
-            assert_eq!(relative(Path::new(from), Path::new(to)), way);
+            assert_eq!(relative(Path::new(from), Path::new(to)), path);
         }
     }
 }

@@ -318,7 +318,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn half_precision_rounds_what_it_is_told_to() {
+    fn half_precision_rounds_the_requested_fields() {
         let field = generate(&SyntheticConfig::default()).field;
         let (same, bytes) = store(&field, false, false, false);
         assert!(same == field);

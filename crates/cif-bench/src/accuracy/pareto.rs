@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn climbs_are_told_in_one_sentence() {
+    fn climbs_are_described_in_one_sentence() {
         let climb = |cost, psnr, iou| Climb { cost, psnr, iou };
         let text = sentence("a", "b", &climb(100.0, Some(0.5), Some(2.0)), "s");
         assert_eq!(

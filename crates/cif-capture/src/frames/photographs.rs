@@ -15,7 +15,7 @@ use crate::picture::{Impression, Photograph};
 use crate::source::Source;
 use crate::{Error, Hooks};
 
-/// The photographs of a camera in name order; such that show nothing are left out. Larger ones than wanted are reduced
+/// The photographs of a camera in name order; such that show nothing are left out. Larger ones than requested are reduced
 /// and those that lie on their side turned upright below `folder`, all others stay where they are.
 pub(super) fn read(
     source: &Source,

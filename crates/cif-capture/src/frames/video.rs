@@ -270,9 +270,9 @@ fn write(
             let mut pipe = BufReader::new(pipe);
             let (mut sizes, mut memory) = (Vec::with_capacity(taken.len()), Vec::new());
             for number in 0.. {
-                let Some(wanted) = taken.get(sizes.len()) else { break };
+                let Some(selected) = taken.get(sizes.len()) else { break };
                 let Some(frame) = pixmap::next(&mut pipe, std::mem::take(&mut memory))? else { break };
-                if number < *wanted {
+                if number < *selected {
                     memory = frame.into_memory();
                     continue;
                 }
@@ -496,7 +496,7 @@ mod tests {
     }
 
     #[test]
-    fn variable_rates_and_black_frames_are_told() {
+    fn variable_rates_and_black_frames_are_reported() {
         let folder = tempfile::tempdir().unwrap();
         // Every third frame is dropped, and the first second is black.
         let filter = "testsrc=duration=3:size=96x64:rate=10,drawbox=t=fill:color=black:enable='lt(t,1)',\

@@ -406,7 +406,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_read_is_told() {
+    fn what_cannot_be_read_is_reported() {
         let good = document(SENSOR, "", &camera("a.jpg", "", POSE));
         for (from, to, message) in [
             ("<chunk", "<chank", "chunk"),

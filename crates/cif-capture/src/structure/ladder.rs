@@ -75,7 +75,8 @@ pub fn find(request: &Request<'_>, hooks: &Hooks<'_>) -> Result<Found, Error> {
         if let Some(camera) = standing(&cameras, &pairs, &moved).filter(|_| !request.moving) {
             return Err(stands_still(camera, &cameras));
         }
-        let solve = |wanted| Ok(run(&Job { runs: &[wanted], ..job.clone() }, hooks)?.runs.pop().flatten());
+        let solve =
+            |requested| Ok(run(&Job { runs: &[requested], ..job.clone() }, hooks)?.runs.pop().flatten());
         match rung(names.len(), &solve)? {
             Some((mapper, poses, verdict)) => {
                 let setting = format!("{name}, {mapper} mapper");

@@ -17,8 +17,8 @@ pub enum Order {
 /// Pairs `(a, b)` with a < b, ascending. `cameras` holds the camera of each image; images are ordered by
 /// camera, then by time.
 ///
-/// In sequences every image is matched with those 1, 2, 4, 8, 16, ... further on, and with those at the same share of the
-/// way in the other cameras. Poses are no worse than by the ten that follow and every 16th: two rendered walks came
+/// In sequences every image is matched with those 1, 2, 4, 8, 16, ... further on, and with those at the same fraction of the
+/// path in the other cameras. Poses are no worse than by the ten that follow and every 16th: two rendered walks came
 /// out 0.40 and 2.0 % of their spread off, before 0.52 and 2.1 %, at half the pairs.
 pub(super) fn pairs(cameras: &[&str], order: Order) -> Vec<(usize, usize)> {
     let count = cameras.len();

@@ -388,7 +388,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_pycolmap_is_told_with_the_way_to_install_it() {
+    fn a_missing_pycolmap_is_reported_with_how_to_install_it() {
         let error = pycolmap_missing("No module named 'pycolmap'", "/usr/bin/python3", "3.12.1");
         let Error::System(cif_system::Error::Refused { problem, fix }) = error else {
             panic!("another error")

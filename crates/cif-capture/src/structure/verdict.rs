@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn few_images_wrong_lenses_and_large_errors_are_told() {
+    fn few_images_wrong_lenses_and_large_errors_are_reported() {
         let a = arc(20);
         for (change, expected) in [
             (

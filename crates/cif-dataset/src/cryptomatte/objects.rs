@@ -12,7 +12,7 @@ pub type ObjectIds = BTreeMap<u32, u16>;
 /// Name of the object that holds whatever belongs to no instance.
 pub const BACKGROUND: &str = "background";
 
-/// File beside Cryptomatte masks that says which mask value each object has: `{"name": id}`, 0 for none.
+/// File next to Cryptomatte masks that says which mask value each object has: `{"name": id}`, 0 for none.
 const OBJECTS_FILE: &str = "objects.json";
 
 /// The mask values that the folder itself gives to objects.
@@ -122,8 +122,8 @@ fn some<'a>(names: impl Iterator<Item = &'a str>) -> String {
 /// not matter; a label of several instances names none of them.
 fn instance_of(name: &str, named: &BTreeMap<u16, InstanceLabel>) -> Option<u16> {
     let by_label = |name: &str| {
-        let wanted = plain(name);
-        let mut found = named.values().filter(|instance| plain(&instance.label) == wanted);
+        let requested = plain(name);
+        let mut found = named.values().filter(|instance| plain(&instance.label) == requested);
         found.next().map(|instance| instance.id).filter(|_| found.next().is_none())
     };
     let by_unique_name = |name: &str| {

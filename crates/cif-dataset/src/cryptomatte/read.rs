@@ -98,7 +98,7 @@ fn choose_layer(path: &Path, texts: &BTreeMap<String, String>) -> Result<(String
     }
 }
 
-/// A manifest beside the file.
+/// A manifest next to the file.
 fn side_car(path: &Path, file: &str) -> Result<String, Error> {
     let inside = Path::new(file).components().all(|part| matches!(part, Component::Normal(_)));
     if !inside {

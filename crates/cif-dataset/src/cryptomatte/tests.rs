@@ -184,7 +184,7 @@ fn headers_that_claim_more_than_the_file_holds_are_not_believed() {
 }
 
 #[test]
-fn manifests_beside_the_file_are_read() {
+fn manifests_next_to_the_file_are_read() {
     let folder = tempfile::tempdir().unwrap();
     let mut file = File::default().set("manif_file", "names.json");
     file.attributes.retain(|(name, _)| *name != "manifest");
@@ -246,7 +246,7 @@ fn without_labels_objects_are_numbered_by_name() {
 }
 
 #[test]
-fn a_table_beside_the_files_decides() {
+fn a_table_next_to_the_files_decides() {
     let mut instances = labels(&[(1, "mug"), (7, "box")]);
     let explicit = BTreeMap::from([("mug".to_owned(), 0), ("thing".to_owned(), 7)]);
     let objects = named(&["mug", "thing"]);

@@ -40,7 +40,7 @@ pub(crate) fn decode(path: &Path, image_size: (u32, u32), turn: Turn) -> Result<
     Ok(turn.seen(mask::decode(path).map_err(of_confidence)?, image_size))
 }
 
-/// The error of a mask file, told of a confidence.
+/// The error of a mask file, as one of a confidence.
 fn of_confidence(error: Error) -> Error {
     match error {
         Error::Mask { path, problem } => {

@@ -58,7 +58,7 @@ pub(crate) fn probe(path: &Path) -> Result<ImageHeader, Error> {
         return Err(Error::Image { path: path.to_owned(), problem });
     }
     if png && !ends_with_iend(path)? {
-        // Bytes after the end are legal, so that only decoding can tell.
+        // Bytes after the end are legal, so that only decoding shows damage.
         open(path)?.decode().map_err(problem(path))?;
     }
     // EXIF that cannot be read says nothing.

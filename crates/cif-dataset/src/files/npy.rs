@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn integers_of_any_width_are_read_and_floats_are_told_apart() {
+    fn integers_of_any_width_are_read_and_floats_are_distinguished() {
         for (descr, data) in [
             ("<i8", 7_i64.to_le_bytes().to_vec()),
             ("<u8", 7_u64.to_le_bytes().to_vec()),
@@ -314,16 +314,16 @@ mod tests {
             assert_eq!((array.shape, array.values), (vec![1], vec![7.0]), "{descr}");
         }
         let floats = file("<f8", "False", "(1,)", &7_f64.to_le_bytes());
-        let told = parsed(&floats, Elements::Integers).err().unwrap();
-        assert!(told.contains("integers are expected"), "{told}");
+        let message = parsed(&floats, Elements::Integers).err().unwrap();
+        assert!(message.contains("integers are expected"), "{message}");
     }
 
     #[test]
     fn short_files_are_refused() {
-        let told = parsed(&file("<f8", "False", "(2, 1)", &[0; 12]), Elements::Floats).err().unwrap();
-        assert!(told.contains("cut short"), "{told}");
-        let told = parsed(&file("<f8", "False", "(2, 100000)", &[0; 12]), Elements::Floats).err().unwrap();
-        assert!(told.contains("more elements than the file holds"), "{told}");
+        let message = parsed(&file("<f8", "False", "(2, 1)", &[0; 12]), Elements::Floats).err().unwrap();
+        assert!(message.contains("cut short"), "{message}");
+        let message = parsed(&file("<f8", "False", "(2, 100000)", &[0; 12]), Elements::Floats).err().unwrap();
+        assert!(message.contains("more elements than the file holds"), "{message}");
     }
 
     #[test]
@@ -331,7 +331,7 @@ mod tests {
         // 600 frames of zeros: 1032 times smaller when they are packed.
         let header = file("|u1", "False", "(600, 1024, 1024)", &[]);
         let size = header.len() as u64 + 600 * (1 << 20);
-        let told = parse(header.chain(std::io::repeat(0)), size, Elements::Integers, Ok).err().unwrap();
-        assert!(told.contains("[600, 1024, 1024] = 629145600 elements"), "{told}");
+        let message = parse(header.chain(std::io::repeat(0)), size, Elements::Integers, Ok).err().unwrap();
+        assert!(message.contains("[600, 1024, 1024] = 629145600 elements"), "{message}");
     }
 }

@@ -88,11 +88,11 @@ pub(crate) fn read_points(path: &Path) -> Result<RawPoints, Error> {
             parser.read_payload_for_element(&mut reader, element, &header).map_err(damaged)?;
             continue;
         }
-        let kind = |wanted: &[&str]| {
-            let property = wanted.iter().find_map(|wanted| element.properties.get(*wanted))?;
+        let kind = |names: &[&str]| {
+            let property = names.iter().find_map(|name| element.properties.get(*name))?;
             Some(property.data_type.clone())
         };
-        let has = |wanted: &[&str]| kind(wanted).is_some();
+        let has = |names: &[&str]| kind(names).is_some();
         if !(has(&["x"]) && has(&["y"]) && has(&["z"])) {
             return Err(Error::invalid(path, "its vertices have no x, y and z"));
         }

@@ -13,7 +13,7 @@ use crate::Error;
 /// Folder inside a capture that holds extracted frames.
 const CACHE: &str = ".cif_frames";
 
-/// Frames that are wanted of a video.
+/// Frames that are requested of a video.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Extraction {
     /// Most frames, from the start on.
@@ -44,9 +44,9 @@ pub(crate) fn frames(
     root: &Path,
     video: &Path,
     images: &Path,
-    wanted: Extraction,
+    extraction: Extraction,
 ) -> Result<Vec<PathBuf>, Error> {
-    frames_with(OsStr::new("ffmpeg"), root, video, images, wanted)
+    frames_with(OsStr::new("ffmpeg"), root, video, images, extraction)
 }
 
 fn frames_with(
@@ -54,10 +54,10 @@ fn frames_with(
     root: &Path,
     video: &Path,
     images: &Path,
-    wanted: Extraction,
+    extraction: Extraction,
 ) -> Result<Vec<PathBuf>, Error> {
     cif_input::check(video).map_err(Error::read(video))?;
-    let name = wanted.folder(&listing::stem(video));
+    let name = extraction.folder(&listing::stem(video));
     let caches =
         [root.join(CACHE), std::env::temp_dir().join(format!("cif_frames_{:016x}", fingerprint(root)))];
     let changed = |path: &Path| std::fs::metadata(path).and_then(|data| data.modified()).ok();
@@ -86,8 +86,8 @@ fn frames_with(
     let output = Command::new(ffmpeg)
         .args(["-nostdin", "-v", "error", "-i"])
         .arg(cif_input::for_ffmpeg(video).map_err(Error::read(video))?)
-        .args(["-frames:v", &wanted.most.to_string()])
-        .args(wanted.size.iter().flat_map(|[width, height]| {
+        .args(["-frames:v", &extraction.most.to_string()])
+        .args(extraction.size.iter().flat_map(|[width, height]| {
             ["-vf".to_owned(), format!("scale='min(iw,{width})':'min(ih,{height})':flags=area")]
         }))
         .args(["-start_number", "0"])
@@ -126,7 +126,7 @@ fn numbered(folder: &Path) -> Result<Vec<PathBuf>, Error> {
     Ok(found)
 }
 
-/// An empty folder beside the final one, removed again unless it takes its place.
+/// An empty folder next to the final one, removed again unless it takes its place.
 fn begun(cache: &Path) -> io::Result<(Scratch, PathBuf)> {
     std::fs::create_dir_all(cache)?;
     let scratch = Scratch::inside(cache)?;
@@ -177,8 +177,9 @@ mod tests {
         let script = "#!/bin/sh\necho 'moov atom not found' >&2\necho 'Invalid data' >&2\nexit 1\n";
         std::fs::write(&program, script).unwrap();
         std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
-        let wanted = Extraction { most: 300, size: None };
-        let error = frames_with(program.as_os_str(), root.path(), &video, root.path(), wanted).unwrap_err();
+        let extraction = Extraction { most: 300, size: None };
+        let error =
+            frames_with(program.as_os_str(), root.path(), &video, root.path(), extraction).unwrap_err();
         assert!(error.to_string().ends_with("moov atom not found; Invalid data"), "{error}");
     }
 
@@ -194,11 +195,11 @@ mod tests {
         std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
         let root = outer.path().join("50%d");
         std::fs::create_dir(&root).unwrap();
-        let wanted = Extraction { most: 3, size: None };
+        let extraction = Extraction { most: 3, size: None };
         for name in ["-cam.mp4", "cam:0.mp4", "100%03d.mp4"] {
             let video = root.join(name);
             std::fs::write(&video, b"no video").unwrap();
-            let found = frames_with(program.as_os_str(), &root, &video, &root, wanted).unwrap();
+            let found = frames_with(program.as_os_str(), &root, &video, &root, extraction).unwrap();
             let text = |path: &Path| std::fs::read_to_string(path).unwrap();
             assert!(text(&found[0]).contains(&format!("-i file:{}", video.display())), "{}", text(&found[0]));
             assert_eq!(text(&found[1]).trim(), "%04d.png", "no folder is part of the pattern");
@@ -223,20 +224,22 @@ mod tests {
         .unwrap();
         std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
         let images = root.path().join("cam00/images");
-        let wanted = Extraction { most: 300, size: Some([9, 5]) };
-        let first = frames_with(program.as_os_str(), root.path(), &video, &images, wanted).unwrap();
+        let extraction = Extraction { most: 300, size: Some([9, 5]) };
+        let first = frames_with(program.as_os_str(), root.path(), &video, &images, extraction).unwrap();
         assert_eq!(first.len(), 2);
         assert!(first[0].ends_with(".cif_frames/cam00-300-9x5/0000.png"));
         // The second call needs no program.
         let second =
-            frames_with(OsStr::new("no-such-program"), root.path(), &video, &images, wanted).unwrap();
+            frames_with(OsStr::new("no-such-program"), root.path(), &video, &images, extraction).unwrap();
         assert_eq!(first, second);
         // Other frames are others.
-        let fewer = Extraction { most: 1, ..wanted };
+        let fewer = Extraction { most: 1, ..extraction };
         assert!(frames_with(OsStr::new("no-such-program"), root.path(), &video, &images, fewer).is_err());
         // Anybody may have put other frames there.
         let cache = root.path().join(CACHE);
         std::fs::set_permissions(&cache, std::fs::Permissions::from_mode(0o777)).unwrap();
-        assert!(frames_with(OsStr::new("no-such-program"), root.path(), &video, &images, wanted).is_err());
+        assert!(
+            frames_with(OsStr::new("no-such-program"), root.path(), &video, &images, extraction).is_err()
+        );
     }
 }

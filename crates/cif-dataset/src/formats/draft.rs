@@ -1,4 +1,4 @@
-//! A capture as its files tell it, and what several layouts have in common.
+//! A capture as its files give it, and what several layouts have in common.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ pub(crate) struct Source<'a> {
     pub(crate) options: &'a OpenOptions,
 }
 
-/// A capture as its files tell it.
+/// A capture as its files give it.
 #[derive(Default)]
 pub(crate) struct Draft {
     pub(crate) frames: Vec<DraftFrame>,
@@ -36,14 +36,14 @@ pub(crate) struct Draft {
     pub(crate) unused: Vec<String>,
     /// Recordings that frames were made of, by the name of the frame, where they are known.
     pub(crate) sources: BTreeMap<String, FrameSource>,
-    /// Cameras are of the pixels as image files store them, where sizes do not tell that they are of upright ones.
+    /// Cameras are of the pixels as image files store them, where sizes do not show that they are of upright ones.
     pub(crate) of_stored_pixels: bool,
     /// Facts of its world that the capture does not know.
     pub(crate) unknown: Option<String>,
 }
 
 impl Draft {
-    /// Takes the frames of cameras out that are not wanted.
+    /// Removes the frames of unwanted cameras.
     ///
     /// # Errors
     /// When there is no such camera.
@@ -61,7 +61,7 @@ impl Draft {
     }
 }
 
-/// One frame as its files tell it.
+/// One frame as its files give it.
 pub(crate) struct DraftFrame {
     pub(crate) name: String,
     pub(crate) camera_name: String,

@@ -111,7 +111,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         unused.push(format!("{unlisted} images in {} that dataset.json does not list", folder.display()));
     }
     let mut notes = Vec::new();
-    let points = colmap::points_beside(root, &frames, &mut notes, &mut warnings)?;
+    let points = colmap::points_next_to(root, &frames, &mut notes, &mut warnings)?;
     Ok(Draft {
         frames,
         stored_reduction: reduction,
@@ -261,9 +261,9 @@ fn listed(
         .collect())
 }
 
-/// The image folder to read for a wanted reduction, and its own reduction: the coarsest stored one that divides
-/// the wanted reduction, else the largest images.
-fn image_folder(root: &Path, wanted: u32) -> Result<(PathBuf, u32), Error> {
+/// The image folder to read for a requested reduction, and its own reduction: the coarsest stored one that divides
+/// the requested reduction, else the largest images.
+fn image_folder(root: &Path, requested: u32) -> Result<(PathBuf, u32), Error> {
     let rgb = root.join("rgb");
     let missing = |fix: &str| Error::MissingFile { path: rgb.clone(), fix: fix.to_owned() };
     if !rgb.is_dir() {
@@ -281,7 +281,7 @@ fn image_folder(root: &Path, wanted: u32) -> Result<(PathBuf, u32), Error> {
     stored.sort();
     let first = stored.first().ok_or_else(|| missing("it has no folder 1x, 2x, ... with images"))?.clone();
     let (factor, folder) =
-        stored.into_iter().rev().find(|(factor, _)| wanted.is_multiple_of(*factor)).unwrap_or(first);
+        stored.into_iter().rev().find(|(factor, _)| requested.is_multiple_of(*factor)).unwrap_or(first);
     Ok((folder, factor))
 }
 

@@ -50,8 +50,8 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let Some(first) = poses.cameras.first() else {
         return Err(Error::invalid(&poses.path, "it has no row; give one per image"));
     };
-    // The largest images, or the smallest that the wanted reduction is a multiple of.
-    let wanted = source.options.downscale.unwrap_or(1);
+    // The largest images, or the smallest that the requested reduction is a multiple of.
+    let requested = source.options.downscale.unwrap_or(1);
     let mut folders = Vec::new();
     for folder in image_folders(root)? {
         let images = listing::images(&folder)?;
@@ -61,7 +61,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     folders.sort();
     folders.dedup_by_key(|(reduction, ..)| *reduction);
     let largest = folders.first().cloned();
-    let fitting = folders.into_iter().rev().find(|(reduction, ..)| wanted.is_multiple_of(*reduction));
+    let fitting = folders.into_iter().rev().find(|(reduction, ..)| requested.is_multiple_of(*reduction));
     let Some((stored_reduction, _, images)) = fitting.or(largest) else {
         return Err(Error::MissingFile {
             path: root.join("images"),
@@ -102,7 +102,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         .collect();
     let mut warnings = Vec::new();
     let mut notes = Vec::new();
-    let points = colmap::points_beside(root, &frames, &mut notes, &mut warnings)?;
+    let points = colmap::points_next_to(root, &frames, &mut notes, &mut warnings)?;
     frames.extend(seen_by_others);
     Ok(Draft { frames, stored_reduction, points, warnings, notes, unused, ..Draft::default() })
 }

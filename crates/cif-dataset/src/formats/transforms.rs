@@ -25,7 +25,7 @@ pub(super) struct TransformsFile {
     pub(super) cif: Option<World>,
 }
 
-/// Knowledge of the world that poses are in. Files of others do not tell, and are taken at their word.
+/// Knowledge of the world that poses are in. Files of others do not state it, and are taken at their word.
 #[derive(Clone, Copy, Deserialize)]
 pub(super) struct World {
     #[serde(default = "known")]
@@ -158,7 +158,7 @@ pub(super) fn inside(root: &Path, file_paths: &[&Path]) -> Vec<PathBuf> {
     paths.iter().map(|path| path.strip_prefix(&folder).unwrap_or(path).to_owned()).collect()
 }
 
-/// The folder that all of some files share, as far as their paths tell.
+/// The folder that all of some files share, as far as their paths show.
 pub(super) fn common_folder<'a>(paths: impl Iterator<Item = &'a Path>) -> PathBuf {
     let folders = paths.map(|path| path.parent().unwrap_or(Path::new("")).to_owned());
     let shared = |a: PathBuf, b: PathBuf| {

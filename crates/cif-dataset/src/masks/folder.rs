@@ -6,7 +6,7 @@ use cif_output::{Scratch, folder_of};
 
 use crate::Error;
 
-/// A folder being filled beside its final place.
+/// A folder being filled next to its final place.
 pub struct NewFolder {
     scratch: Scratch,
     partial: PathBuf,

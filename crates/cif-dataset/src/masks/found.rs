@@ -38,7 +38,7 @@ pub fn found_masks(dataset: &Dataset, folder: &Path) -> Result<Vec<Vec<PathBuf>>
     Ok(masks)
 }
 
-/// Files of a folder with an ending by frame, `[frames]`, as [`found_masks`] tells whose they are, and how many there
+/// Files of a folder with an ending by frame, `[frames]`, as [`found_masks`] assigns them, and how many there
 /// are in all.
 pub(crate) fn files_of_frames(
     dataset: &Dataset,

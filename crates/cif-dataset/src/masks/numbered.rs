@@ -75,8 +75,8 @@ mod tests {
         assert_eq!(first(&[2, 5, 8], 8), Ok(1));
         // One too few or many, a part, and gaps in the middle: not known.
         for numbers in [&[0, 1, 2][..], &[0, 1, 2, 3, 4], &[1, 2, 3], &[2, 3], &[2], &[1, 3], &[0, 2, 9]] {
-            let told = first(numbers, 4).unwrap_err();
-            assert!(told.contains("leave open"), "{numbers:?}: {told}");
+            let message = first(numbers, 4).unwrap_err();
+            assert!(message.contains("leave open"), "{numbers:?}: {message}");
         }
         assert!(first(&[], 4).is_err());
     }

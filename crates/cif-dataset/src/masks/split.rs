@@ -38,7 +38,7 @@ pub struct RemovedInstance {
     pub missing_in: Vec<String>,
 }
 
-/// Result of [`split_tracker_masks`]; stored as `instances.json` beside the masks.
+/// Result of [`split_tracker_masks`]; stored as `instances.json` next to the masks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SplitReport {
     /// Kept instances, ascending id.

@@ -27,7 +27,7 @@ impl MaskWriter {
         Ok(Self { folder: NewFolder::create(place)?, place: place.to_owned() })
     }
 
-    /// Folder that is being filled, for other files that belong beside the masks.
+    /// Folder that is being filled, for other files that belong next to the masks.
     #[must_use]
     pub fn path(&self) -> &Path {
         self.folder.path()

@@ -14,7 +14,7 @@ use super::view_order::{ViewOrder, ordered_views};
 use crate::files::{image, json};
 use crate::{Dataset, Error};
 
-/// File beside the images that says which frame each of them is.
+/// File next to the images that says which frame each of them is.
 pub const INDEX_FILE: &str = "zigzag.json";
 
 /// Position in the sequence of a frame of a view, all from 0, with `frames` frames per view.
@@ -120,7 +120,7 @@ fn sequence(dataset: &Dataset, order: ViewOrder) -> (Vec<String>, f64, Vec<(usiz
 }
 
 /// Writes the images of a capture into a new folder as one numbered sequence for a video tracker, with
-/// `zigzag.json` beside them. Frames are ordered by time inside a view, and views alternate in direction.
+/// `zigzag.json` next to them. Frames are ordered by time inside a view, and views alternate in direction.
 ///
 /// Images are written as captured, at their stored size and with their lens, since masks belong to captured
 /// images; alpha is composited on white.

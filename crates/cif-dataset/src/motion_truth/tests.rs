@@ -90,9 +90,9 @@ fn damaged_poses_name_the_file_and_the_remedy() {
         let mut value = motion();
         edit(&mut value);
         let (_folder, json, _) = folder(&value);
-        let told = MotionTruth::read(&json).unwrap_err().to_string();
-        assert!(told.starts_with(&json.display().to_string()), "{told}");
-        assert!(words.iter().all(|word| told.contains(word)), "{words:?} in {told}");
+        let message = MotionTruth::read(&json).unwrap_err().to_string();
+        assert!(message.starts_with(&json.display().to_string()), "{message}");
+        assert!(words.iter().all(|word| message.contains(word)), "{words:?} in {message}");
     };
     refused(&|value| value["instances"] = serde_json::json!(null), &["expected are `frames`"]);
     refused(
@@ -122,9 +122,9 @@ fn damaged_poses_name_the_file_and_the_remedy() {
 fn damaged_tracks_name_the_file_and_the_remedy() {
     let (_folder, json, tracks) = folder(&motion());
     let refused = |words: &[&str]| {
-        let told = MotionTruth::read(&json).unwrap().add_tracks(&tracks).unwrap_err().to_string();
-        assert!(told.starts_with(&tracks.display().to_string()), "{told}");
-        assert!(words.iter().all(|word| told.contains(word)), "{words:?} in {told}");
+        let message = MotionTruth::read(&json).unwrap().add_tracks(&tracks).unwrap_err().to_string();
+        assert!(message.starts_with(&tracks.display().to_string()), "{message}");
+        assert!(words.iter().all(|word| message.contains(word)), "{words:?} in {message}");
     };
     let good = || points("(1, 1, 2, 3)", &[0.0; 6]);
     let write = |members: &[(&str, Vec<u8>)]| npz(&tracks, CompressionMethod::Stored, members);

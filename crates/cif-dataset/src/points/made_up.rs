@@ -1,6 +1,6 @@
 //! Recognises points that a program drew at random: uniform in a box, with colours that have nothing to do with places.
 //!
-//! Code of 3D Gaussian splatting starts captures without points from such a cube and leaves it beside them as
+//! Code of 3D Gaussian splatting starts captures without points from such a cube and leaves it next to them as
 //! `points3d.ply`, `fused.ply` or `sparse_pc.ply`, where it reads like a reconstruction. Three statistics have a known
 //! distribution for such points, whatever the box and their number, and a bound is passed by chance about once in a
 //! million clouds:

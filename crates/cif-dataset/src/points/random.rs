@@ -12,7 +12,7 @@ const IN_BOX: usize = 2_000;
 /// Points drawn where the cameras look.
 const IN_VIEW: usize = 10_000;
 
-/// Draws per point wanted before giving up on unseen places.
+/// Draws per requested point before giving up on unseen places.
 const ATTEMPTS: usize = 50;
 
 /// The same capture always gets the same points.

@@ -102,10 +102,10 @@ mod tests {
     }
 
     #[test]
-    fn points_behind_all_cameras_are_told() {
-        let told = unseen_warning(&dataset(-3.0)).unwrap();
+    fn points_behind_all_cameras_are_reported() {
+        let message = unseen_warning(&dataset(-3.0)).unwrap();
         for word in ["points3D.bin", "0 of 2000 of its 5000 points", "2000 lie behind all"] {
-            assert!(told.contains(word), "{word} in {told}");
+            assert!(message.contains(word), "{word} in {message}");
         }
         // In front, and beside the picture.
         let mut beside = dataset(3.0);

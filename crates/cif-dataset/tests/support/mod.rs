@@ -208,7 +208,7 @@ pub fn hypernerf(count: usize) -> TempDir {
     folder
 }
 
-/// DyCheck's capture of a phone that moves and one that stands: `hypernerf` with two cameras, lists and much beside.
+/// DyCheck's capture of a phone that moves and one that stands: `hypernerf` with two cameras, lists and much more.
 pub fn dycheck() -> TempDir {
     let folder = hypernerf(1);
     let root = folder.path();

@@ -11,12 +11,12 @@ pub struct Checkpoint {
     pub field: Field,
     /// State of the run; `None` in a finished scene.
     pub training: Option<TrainingState>,
-    /// Tensors by which a finished scene tells labels of pixels other than by its identity rows: the head that
-    /// it was trained with, by name, and what that learnt. `None` where its rows tell them.
+    /// Tensors by which a finished scene labels pixels other than by its identity rows: the head that
+    /// it was trained with, by name, and what that learnt. `None` where its rows label them.
     pub head: Option<TrainingState>,
 }
 
-/// State beside the field: that from which a run goes on exactly as if it had not been interrupted, or that of a head.
+/// State with the field: that from which a run goes on exactly as if it had not been interrupted, or that of a head.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TrainingState {
     /// Counters, settings, random generators.
@@ -38,7 +38,7 @@ pub enum StateTensor {
     U64(Vec<u64>),
 }
 
-/// Contents that are written beside a field.
+/// Contents that are written with a field.
 #[derive(Clone, Copy, Default)]
 pub(super) struct States<'a> {
     pub(super) training: Option<&'a TrainingState>,

@@ -32,7 +32,7 @@
 //! | `identities.owners` | I32 | `[N]`: an instance, -1 for none, -2 where the identity row decides; absent where all do |
 //! | `training.<name>`, `head.<name>` | F32, F64, U32 or U64 | `[length]` |
 //!
-//! Floats survive bit by bit, in tensors and in JSON; equal fields give equal bytes. A file is written beside
+//! Floats survive bit by bit, in tensors and in JSON; equal fields give equal bytes. A file is written next to
 //! its destination and renamed, so a failed save leaves what was there. A reader trusts nothing: it allocates
 //! no more than a small multiple of the file's length, and checks everything that later code relies on.
 

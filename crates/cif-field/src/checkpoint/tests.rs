@@ -237,7 +237,7 @@ fn headers_that_announce_too_much_are_refused_before_anything_is_allocated() {
 }
 
 #[test]
-fn foreign_files_are_told_apart() {
+fn foreign_files_are_distinguished() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("other.cif");
     let load = |bytes: &[u8]| {
@@ -324,7 +324,7 @@ fn joints_survive_raise_the_format_and_are_checked() {
     let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).unwrap();
     assert_eq!(header.metadata().clone().unwrap()["cif.format"], "6");
     assert_eq!(read_bytes(&bytes).unwrap(), jointed);
-    for (wrong, told) in [
+    for (wrong, reason) in [
         (Joint { base: 2, ..joint }, "only an earlier one"),
         (Joint { axis: DVec3::new(0.6, 0.0, 0.9), ..joint }, "axis is not unit"),
         (Joint { axis: DVec3::NAN, ..joint }, "axis is not unit"),
@@ -332,7 +332,7 @@ fn joints_survive_raise_the_format_and_are_checked() {
         let mut field = jointed.field.clone();
         field.tracks.as_mut().unwrap().groups[2].joint = Some(wrong);
         let error = field.validate().unwrap_err().to_string();
-        assert!(error.contains(told), "{error}");
+        assert!(error.contains(reason), "{error}");
     }
     // A base without Gaussians goes, and its joints with it; others are renumbered.
     let tracks = jointed.field.tracks.clone().unwrap();
@@ -380,8 +380,8 @@ fn instances_of_groups_survive_raise_the_format_and_are_checked() {
         }
     };
     for owner in [Owner::Background, Owner::Instance(0)] {
-        let told = problem(&owned(owner));
-        assert!(told.contains(&format!("but its Gaussian {row} is not")), "{told}");
+        let message = problem(&owned(owner));
+        assert!(message.contains(&format!("but its Gaussian {row} is not")), "{message}");
     }
     let mut field = named.field.clone();
     owned(Owner::Instance(1))(&mut field);

@@ -40,7 +40,7 @@ struct Header<'a> {
     tensors: BTreeMap<&'a str, TensorInfo>,
 }
 
-/// Writes a file beside `path` and renames it.
+/// Writes a file next to `path` and renames it.
 pub(super) fn save(path: &Path, field: &Field, states: States<'_>) -> Result<(), CheckpointError> {
     replace_file(path, |file| write(file, path, field, states))
 }

@@ -50,7 +50,7 @@ impl Deformation {
         let channels = self.config.channels as usize;
         let mut features = vec![[1.0; LANES]; self.config.features()];
         for (lane, position) in positions.iter().enumerate() {
-            // Coordinates in f64 cost little beside the layers and keep fine cells exact.
+            // Coordinates in f64 cost little compared with the layers and keep fine cells exact.
             let position = position.map(f64::from);
             for (level, layouts) in levels.iter().enumerate() {
                 let features = &mut features[level * channels..(level + 1) * channels];

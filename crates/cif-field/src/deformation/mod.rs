@@ -231,14 +231,14 @@ impl DeformationConfig {
         };
         let width = self.width as usize;
         let trunk = linear(self.features(), width);
-        let wanted = [
+        let heads = [
             (self.heads.position, HeadKind::Position),
             (self.heads.scale, HeadKind::Scale),
             (self.heads.rotation, HeadKind::Rotation),
             (self.heads.opacity, HeadKind::Opacity),
             (self.heads.sh, HeadKind::Sh),
         ];
-        let heads = wanted
+        let heads = heads
             .into_iter()
             .filter(|(on, _)| *on)
             .map(|(_, kind)| HeadLayout {

@@ -44,8 +44,8 @@ pub struct Tracks {
 pub struct TrackGroup {
     /// Name of the object, for people.
     pub name: String,
-    /// Id ([`crate::Instance::id`]) of the instance that the group is of; `None` for the background, and where nobody
-    /// told (files before format 9). With an id
+    /// Id ([`crate::Instance::id`]) of the instance that the group is of; `None` for the background, and where it is not
+    /// recorded (files before format 9). With an id
     ///
     /// - every Gaussian of the group is the instance's, whatever its identity row says; an [`crate::Owner`] that a row has
     ///   is the same instance,
@@ -62,7 +62,7 @@ pub struct TrackGroup {
     pub pivot: DVec3,
     /// Poses by strictly ascending time; empty where the group stays.
     pub poses: Vec<TrackPose>,
-    /// Evidence for the rotations of the poses; `None` where nobody told, as of motion that is not from images.
+    /// Evidence for the rotations of the poses; `None` where it is not recorded, as of motion that is not from images.
     pub rotation: Option<RotationEvidence>,
     /// Ties the poses to those of another part of the same object; `None` where they are free.
     pub joint: Option<Joint>,
@@ -180,7 +180,7 @@ impl DenseTrack {
 }
 
 impl TrackGroup {
-    /// True where pictures may turn the poses: an assumed rotation is one that they do not tell.
+    /// True where pictures may turn the poses: an assumed rotation is one that they do not show.
     #[must_use]
     pub fn turns_are_trained(&self) -> bool {
         self.rotation != Some(RotationEvidence::Assumed)

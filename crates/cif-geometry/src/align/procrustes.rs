@@ -70,7 +70,7 @@ fn rotation_of(covariance: &DMat3) -> Option<DMat3> {
 /// As [`weighted_procrustes`], but points that move differently from the bulk lose their say.
 ///
 /// Starts from the better of the plain fit and `initial`, then re-weights with the Geman-McClure kernel
-/// `1 / (1 + (r / c)^2)^2`, c = 2.5 weighted median residuals, until the fit rests. Stands up to nearly half
+/// `1 / (1 + (r / c)^2)^2`, c = 2.5 weighted median residuals, until the fit is stationary. Stands up to nearly half
 /// of the weight being outliers.
 #[must_use]
 pub fn robust_procrustes(

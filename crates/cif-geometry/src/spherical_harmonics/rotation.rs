@@ -39,7 +39,7 @@ impl<R: Real> HarmonicsRotation<R> {
 
     /// Turns the coefficients of one splat in place: `[(degree + 1)^2, 3]`, DC first, RGB inner.
     ///
-    /// The degree is told by the length; entries beyond the last whole degree (4, 9 or 16 coefficients) are
+    /// The degree follows from the length; entries beyond the last whole degree (4, 9 or 16 coefficients) are
     /// left alone.
     pub fn rotate(&self, coefficients: &mut [R]) {
         let count = coefficients.len() / 3;

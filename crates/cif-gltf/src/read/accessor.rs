@@ -72,10 +72,10 @@ impl Source {
             return Err(format!("{word}{component:?} is not allowed for it; export it as float"));
         }
         let count = usize::try_from(accessor.count.0).map_err(|_| "its count is too large".to_owned())?;
-        if let Some(wanted) = expected.count
-            && wanted != count
+        if let Some(needed) = expected.count
+            && needed != count
         {
-            return Err(format!("{count} values for {wanted} splats or keys; export the file again"));
+            return Err(format!("{count} values for {needed} splats or keys; export the file again"));
         }
         let size = component.size() * N;
         let mut values = match accessor.buffer_view {

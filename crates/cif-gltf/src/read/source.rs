@@ -62,7 +62,7 @@ impl Source {
     fn load_buffers(&mut self, file: Rc<Vec<u8>>, binary: Option<Range<usize>>) -> Result<(), GltfError> {
         let mut files: BTreeMap<PathBuf, Rc<Vec<u8>>> = BTreeMap::new();
         for (index, buffer) in self.root.buffers.iter().enumerate() {
-            let wanted = buffer.byte_length.0;
+            let needed = buffer.byte_length.0;
             let object = || format!("buffer {index}");
             let loaded = match (&buffer.uri, &binary) {
                 (Some(uri), _) if uri.starts_with("data:") => {
@@ -70,7 +70,7 @@ impl Source {
                     Some(Buffer { range: 0..bytes.len(), bytes: Rc::new(bytes) })
                 }
                 (Some(uri), _) => {
-                    let path = self.beside(uri).map_err(|what| self.invalid(object(), what))?;
+                    let path = self.sibling(uri).map_err(|what| self.invalid(object(), what))?;
                     let bytes = match files.get(&path) {
                         Some(bytes) => Rc::clone(bytes),
                         None => {
@@ -91,10 +91,10 @@ impl Source {
                 (None, _) => None,
             };
             if let Some(found) = loaded.as_ref().map(|buffer| buffer.range.len() as u64)
-                && found < wanted
+                && found < needed
             {
                 let what = format!(
-                    "{wanted} bytes are announced, {found} are there: the file is cut off; copy or export it again"
+                    "{needed} bytes are announced, {found} are there: the file is cut off; copy or export it again"
                 );
                 return Err(self.invalid(object(), what));
             }
@@ -104,7 +104,7 @@ impl Source {
     }
 
     /// Path of a relative URI, which must stay in the folder of the file.
-    fn beside(&self, uri: &str) -> Result<PathBuf, String> {
+    fn sibling(&self, uri: &str) -> Result<PathBuf, String> {
         let scheme = uri.split_once(':').is_some_and(|(scheme, _)| {
             scheme.starts_with(|c: char| c.is_ascii_alphabetic())
                 && scheme.chars().all(|c| c.is_ascii_alphanumeric() || "+.-".contains(c))
@@ -225,10 +225,10 @@ fn places(value: &Value) -> BTreeMap<usize, [f64; 3]> {
 fn split(path: &Path, bytes: &[u8]) -> Result<(Range<usize>, Option<Range<usize>>), GltfError> {
     let word =
         |at: usize| bytes.get(at..at + 4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]) as usize);
-    let cut = |found: usize, wanted: usize| {
+    let cut = |found: usize, needed: usize| {
         unreadable(
             path,
-            &format!("{wanted} bytes are announced, {found} are there: the file is cut off; copy it again"),
+            &format!("{needed} bytes are announced, {found} are there: the file is cut off; copy it again"),
         )
     };
     match word(8) {

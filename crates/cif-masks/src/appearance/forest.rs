@@ -57,9 +57,9 @@ impl Samples {
         }
         let mut samples = Self::default();
         for (class, pixels) in pixels.iter().enumerate() {
-            let wanted = (if class == 0 { UNLABELLED_FACTOR * SAMPLES } else { SAMPLES }).min(pixels.len());
-            for k in 0..wanted {
-                samples.points.push(features.values[pixels[k * pixels.len() / wanted]]);
+            let drawn = (if class == 0 { UNLABELLED_FACTOR * SAMPLES } else { SAMPLES }).min(pixels.len());
+            for k in 0..drawn {
+                samples.points.push(features.values[pixels[k * pixels.len() / drawn]]);
                 samples.classes.push(class as u16);
             }
         }

@@ -29,7 +29,7 @@ pub(super) fn mask(
             let weight = (share + FLOOR) * (belief.reliability[pixel] + FLOOR);
             sum += weight;
             let other = directions.get(1 - k).map_or(*belief, |(_, other)| *other);
-            add_told(shares, weight, belief, other, pixel);
+            add_belief(shares, weight, belief, other, pixel);
         }
         shares.iter_mut().for_each(|share| *share /= sum);
     });
@@ -70,7 +70,7 @@ pub(super) fn mask(
 
 /// Adds a belief about a pixel to weighted sums of shares. The belief from a keyframe that does not show an object does
 /// not know where that object is: as far as it is not reliable, the `other` one decides.
-fn add_told(sums: &mut [f32], weight: f32, belief: &Belief, other: &Belief, pixel: usize) {
+fn add_belief(sums: &mut [f32], weight: f32, belief: &Belief, other: &Belief, pixel: usize) {
     let row = pixel * belief.classes..(pixel + 1) * belief.classes;
     let (own, other) = (&belief.shares[row.clone()], &other.shares[row]);
     let open = 1.0 - belief.reliability[pixel];
@@ -110,8 +110,8 @@ mod tests {
             let first = belief([0.8, 0.2, 0.0], reliability, false);
             let second = belief([0.4, 0.0, 0.6], 0.0, true);
             let mut sums = [0.0; 3];
-            add_told(&mut sums, 0.9, &first, &second, 0);
-            add_told(&mut sums, 0.1, &second, &first, 0);
+            add_belief(&mut sums, 0.9, &first, &second, 0);
+            add_belief(&mut sums, 0.1, &second, &first, 0);
             sums
         };
         let close = |found: [f32; 3], expected: [f32; 3]| {

@@ -33,9 +33,9 @@ impl TileEntry {
         self.0 >> Self::RANK_BITS >> blending as u32 & 1 == 1
     }
 
-    /// The groups that each pass wants of the splat, of those that are live in it.
+    /// The groups that each pass needs of the splat, of those that are live in it.
     #[inline(always)]
-    pub(super) fn wanted<const INSTANCES: bool>(self, color: Groups, instances: Groups) -> [Groups; 2] {
+    pub(super) fn needed<const INSTANCES: bool>(self, color: Groups, instances: Groups) -> [Groups; 2] {
         let none = Groups::default();
         [
             if self.draws(Blending::Color) { color } else { none },

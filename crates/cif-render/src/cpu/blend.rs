@@ -42,15 +42,15 @@ impl<'a> DrawnSplats<'a> {
         }
         for (pair, entry) in self.entries.by_ref() {
             let none = Groups::default();
-            let wanted = match self.blending {
-                Blending::Color => entry.wanted::<true>(self.alive, none),
-                Blending::Own => entry.wanted::<true>(none, self.alive),
+            let needed = match self.blending {
+                Blending::Color => entry.needed::<true>(self.alive, none),
+                Blending::Own => entry.needed::<true>(none, self.alive),
             };
-            if wanted[0].union(wanted[1]).is_empty() {
+            if needed[0].union(needed[1]).is_empty() {
                 continue;
             }
             let s = &self.splats[entry.rank()];
-            if let Some(prepared) = prepare(simd, s, self.place, wanted) {
+            if let Some(prepared) = prepare(simd, s, self.place, needed) {
                 let prepared: SplatInTile<S> = prepared;
                 return Some((pair, s, prepared, prepared.groups[self.blending as usize]));
             }

@@ -62,12 +62,12 @@ pub(super) fn instance_tile<S: Simd>(
         if live_color.union(live_instances).is_empty() {
             break;
         }
-        let wanted = entry.wanted::<true>(live_color, live_instances);
-        if wanted[0].union(wanted[1]).is_empty() {
+        let needed = entry.needed::<true>(live_color, live_instances);
+        if needed[0].union(needed[1]).is_empty() {
             continue;
         }
         let s = &splats[entry.rank()];
-        let Some(prepared) = prepare(simd, s, place, wanted) else { continue };
+        let Some(prepared) = prepare(simd, s, place, needed) else { continue };
         let prepared: SplatInTile<S> = prepared;
         let [in_color, in_instances] = prepared.groups;
         let (opacity, occupancy) = (splat(simd, s.opacity), splat(simd, s.occupancy));

@@ -41,8 +41,8 @@ pub(super) fn label_mass_tile<S: Simd>(
             break;
         }
         let s = &splats[entry.rank()];
-        let wanted = [live_color, Groups::default()];
-        let Some(prepared) = prepare(simd, s, place, wanted) else { continue };
+        let needed = [live_color, Groups::default()];
+        let Some(prepared) = prepare(simd, s, place, needed) else { continue };
         let prepared: SplatInTile<S> = prepared;
         let opacity = splat(simd, s.opacity);
         let out = &mut mass[pair * columns..(pair + 1) * columns];

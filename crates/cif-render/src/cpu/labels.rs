@@ -27,13 +27,13 @@ pub(super) struct TileLabels {
 impl TileLabels {
     /// Labels of a tile; `None` when no pixel carries one. The map holds dense index + 1, 0 = unlabelled.
     pub(super) fn new(map: &PixelGrid<u16>, place: &TilePlace) -> Option<Self> {
-        let mut wanted = [[0_u16; LANES]; GROUPS];
+        let mut of_pixels = [[0_u16; LANES]; GROUPS];
         let mut labels = Vec::new();
         let mut last = 0;
         for group in 0..GROUPS {
             for lane in 0..LANES {
                 let label = place.pixel(group, lane).map_or(0, |pixel| map.pixels[pixel]);
-                wanted[group][lane] = label;
+                of_pixels[group][lane] = label;
                 // Neighbours mostly agree.
                 if label != last && label > 0 && !labels.contains(&(label - 1)) {
                     labels.push(label - 1);
@@ -51,7 +51,7 @@ impl TileLabels {
         for group in 0..GROUPS {
             let (mut first, mut mixed) = (None, false);
             for lane in 0..LANES {
-                let label = wanted[group][lane];
+                let label = of_pixels[group][lane];
                 if label == 0 {
                     continue;
                 }
@@ -116,11 +116,11 @@ impl<'a> IdentityRows<'a> {
         let range = self.entries(gaussian);
         let labels = &self.labels[range.clone()];
         let probabilities = &self.probabilities[range];
-        for (wanted, out) in tile_labels.iter().zip(out) {
+        for (requested, out) in tile_labels.iter().zip(out) {
             let entry = if labels.len() <= SHORT_ROW {
-                labels.iter().position(|label| label == wanted)
+                labels.iter().position(|label| label == requested)
             } else {
-                labels.binary_search(wanted).ok()
+                labels.binary_search(requested).ok()
             };
             *out = entry.map_or(0.0, |entry| probabilities[entry]);
         }

@@ -1,4 +1,4 @@
-//! Projects posed Gaussians to the image, sixteen at a time; [`super::project_backward`] is the way back. Source:
+//! Projects posed Gaussians to the image, sixteen at a time; [`super::project_backward`] is the backward pass. Source:
 //! methods reference 3.1, steps 1 to 9.
 //!
 //! Everything of a Gaussian that a pixel needs is one [`Splat`]; the backward pass recomputes the

@@ -154,12 +154,12 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
         if live_color.union(live_instances).is_empty() {
             break;
         }
-        let wanted = entry.wanted::<INSTANCES>(live_color, live_instances);
-        if wanted[0].union(wanted[1]).is_empty() {
+        let needed = entry.needed::<INSTANCES>(live_color, live_instances);
+        if needed[0].union(needed[1]).is_empty() {
             continue;
         }
         let s = &splats[entry.rank()];
-        let Some(prepared) = prepare(simd, s, place, wanted) else { continue };
+        let Some(prepared) = prepare(simd, s, place, needed) else { continue };
         let prepared: SplatInTile<S> = prepared;
         let [in_color, in_instances] = prepared.groups;
         if keeps_met {

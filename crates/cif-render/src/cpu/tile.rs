@@ -161,13 +161,13 @@ pub(super) struct SplatInTile<S: Simd> {
     pub(super) groups: [Groups; 2],
 }
 
-/// The groups that the drawn ellipses of a splat may touch, of those `wanted` by each pass.
+/// The groups that the drawn ellipses of a splat may touch, of those `needed` by each pass.
 ///
 /// All rows at once: the nearest point to the ellipse's centre line of a row of eight pixels is drawn when
 /// `u0^2 <= 2 reach - u1^2` there. It is a hair wider than exact, so that rounding never hides a drawn pixel; the gate
 /// itself decides.
 #[inline(always)]
-fn touched<S: Simd>(simd: S, s: &Splat, first: f32, dy: f32, wanted: [Groups; 2]) -> [Groups; 2] {
+fn touched<S: Simd>(simd: S, s: &Splat, first: f32, dy: f32, needed: [Groups; 2]) -> [Groups; 2] {
     let [l00, l01, l11] = s.factor;
     let zero = splat(simd, 0.0);
     let row_dy = splat(simd, dy) - load(simd, &ROWS);
@@ -183,7 +183,7 @@ fn touched<S: Simd>(simd: S, s: &Splat, first: f32, dy: f32, wanted: [Groups; 2]
     let squared = [left * left, right * right];
     let mut groups = [Groups::default(); 2];
     for pass in 0..2 {
-        if wanted[pass].is_empty() {
+        if needed[pass].is_empty() {
             continue;
         }
         let room = bend + splat(simd, s.reach[pass] * 2.0 * 1.000_02 + 2e-5);
@@ -191,7 +191,7 @@ fn touched<S: Simd>(simd: S, s: &Splat, first: f32, dy: f32, wanted: [Groups; 2]
         for half in 0..2 {
             rows |= (squared[half].simd_le(room).to_bitmask() as u32) << (half * ROWS.len());
         }
-        groups[pass] = Groups((rows | rows >> 1) & 0x5555_5555).both(wanted[pass]);
+        groups[pass] = Groups((rows | rows >> 1) & 0x5555_5555).both(needed[pass]);
     }
     groups
 }
@@ -202,10 +202,10 @@ pub(super) fn prepare<S: Simd>(
     simd: S,
     s: &Splat,
     place: &TilePlace,
-    wanted: [Groups; 2],
+    needed: [Groups; 2],
 ) -> Option<SplatInTile<S>> {
     let [first, first_dy] = place.offset_of(s);
-    let groups = touched(simd, s, first, first_dy, wanted);
+    let groups = touched(simd, s, first, first_dy, needed);
     if groups[0].union(groups[1]).is_empty() {
         return None;
     }

@@ -82,7 +82,7 @@ fn plan_workgroups(at: u32, groups: u32) {
 fn plan() {
     let wanted_pairs = pair_offsets[view.gaussians];
     let wanted_slots = slot_offsets[view.gaussians];
-    // Lists that do not fit are not drawn at all, and the host is told.
+    // Lists that do not fit are not drawn at all, and the host is informed.
     let fits = wanted_pairs <= view.pair_capacity && wanted_slots <= view.slot_capacity;
     let pairs = select(0u, wanted_pairs, fits);
     let sort_blocks = (pairs + SORT_BLOCK - 1u) / SORT_BLOCK;

@@ -42,7 +42,7 @@ var<workgroup> live: array<atomic<u32>, 1>;
 var<workgroup> live_count: u32;
 
 // Stages entries from `first` on; returns how many are kept. Every invocation of the workgroup must come here.
-fn stage(first: u32, end: u32, origin: vec2u, wanted: u32, local: u32) -> u32 {
+fn stage(first: u32, end: u32, origin: vec2u, requested: u32, local: u32) -> u32 {
     if (local < 2u) {
         atomicStore(&kept[local], 0u);
     }
@@ -53,7 +53,7 @@ fn stage(first: u32, end: u32, origin: vec2u, wanted: u32, local: u32) -> u32 {
         let tag = entries[index].y;
         item.row = tag & INDEX_MASK;
         let splat = splats[item.row];
-        item.passes = (tag >> PASS_SHIFT) & wanted & passes_in_quadrant(splat, origin);
+        item.passes = (tag >> PASS_SHIFT) & requested & passes_in_quadrant(splat, origin);
         if (item.passes != 0u) {
             item.mean = splat.mean;
             item.depth = splat.depth;
@@ -118,15 +118,15 @@ fn dense(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_inde
         for (var k = 0u; k < CHUNK; k += 1u) {
             masses[k] = 0.0;
         }
-        let wanted = INSTANCE_PASS | select(0u, COLOR_PASS, first_label == 0u);
-        var open = select(0u, wanted, inside);
+        let requested = INSTANCE_PASS | select(0u, COLOR_PASS, first_label == 0u);
+        var open = select(0u, requested, inside);
         var transmittance = 1.0;
         var instance_transmittance = 1.0;
         for (var first = range.x; first < range.y; first += 64u) {
             if (!any_live(open != 0u, local)) {
                 break;
             }
-            let count = stage(first, range.y, origin, wanted, local);
+            let count = stage(first, range.y, origin, requested, local);
             for (var k = 0u; k < count; k += 1u) {
                 let passes = staged[k].passes & open;
                 if (passes == 0u) {

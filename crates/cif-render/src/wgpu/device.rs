@@ -148,15 +148,15 @@ impl Gpu {
 
     /// As [`Self::open_with`], with subgroups that have not been checked.
     pub(super) fn unchecked(features: GpuFeatures) -> Result<Self, GpuError> {
-        let wanted = GPU_NAME.text().unwrap_or_default();
+        let requested = GPU_NAME.text().unwrap_or_default();
         let all = adapters();
         let names: Vec<String> = all.iter().map(|adapter| adapter.get_info().name).collect();
-        let matches = |name: &str| name.to_lowercase().contains(&wanted.to_lowercase());
+        let matches = |name: &str| name.to_lowercase().contains(&requested.to_lowercase());
         let Some(adapter) = all.into_iter().find(|adapter| matches(&adapter.get_info().name)) else {
             let found = if names.is_empty() {
                 "nothing answered".to_owned()
             } else {
-                format!("{} does not contain {}={wanted}", names.join(", "), GPU_NAME.name())
+                format!("{} does not contain {}={requested}", names.join(", "), GPU_NAME.name())
             };
             return Err(GpuError::NoAdapter { backends: "Vulkan, Metal and Direct3D 12".to_owned(), found });
         };
@@ -349,7 +349,7 @@ impl Gpu {
         self.check()
     }
 
-    /// Tells a fault that was found elsewhere, as the driver would; the first one stays.
+    /// Reports a fault that was found elsewhere, as the driver would; the first one stays.
     pub fn tell(&self, fault: GpuError) {
         self.fault.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(fault);
     }

@@ -171,7 +171,7 @@ fn sum_responsibilities(own: u32, part: u32, local: u32, count: u32, batch: u32,
         var mass = vec4f(0.0);
         if (row_first < row_end) {
             let last = row_end - 1u;
-            let wanted = vec4u(
+            let row_labels = vec4u(
                 identities[row_first].x,
                 identities[min(row_first + 1u, last)].x,
                 identities[min(row_first + 2u, last)].x,
@@ -184,10 +184,10 @@ fn sum_responsibilities(own: u32, part: u32, local: u32, count: u32, batch: u32,
                 let packed = pixel_labels[at];
                 let found = vec4u(packed & vec2u(0xffffu), packed >> vec2u(16u)).xzyw;
                 mass += vec4f(
-                    of_label(wanted.x, found, values),
-                    of_label(wanted.y, found, values),
-                    of_label(wanted.z, found, values),
-                    of_label(wanted.w, found, values),
+                    of_label(row_labels.x, found, values),
+                    of_label(row_labels.y, found, values),
+                    of_label(row_labels.z, found, values),
+                    of_label(row_labels.w, found, values),
                 );
                 continuing {
                     at += 16u;

@@ -270,7 +270,7 @@ fn images() {
                         compare("label", e.into(), a.into(), 0.0);
                     }
                 }
-                worst.tell(&name);
+                worst.report(&name);
                 mismatches.finish(&name);
             }
         }

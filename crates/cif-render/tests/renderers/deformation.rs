@@ -20,7 +20,7 @@ fn with_channels(deformation: &Deformation, channels: u32, random: &mut Pcg64Mcg
     Deformation { config, planes, mlp, ..deformation.clone() }
 }
 
-/// The largest difference beside the largest value.
+/// The largest difference relative to the largest value.
 fn relative_error(actual: &[f32], expected: &[f64]) -> f64 {
     assert_eq!(actual.len(), expected.len());
     let size = expected.iter().fold(0.0_f64, |size, value| size.max(value.abs()));

@@ -66,7 +66,7 @@ fn project_on_the_inputs_of_the_reference() {
             compare("radius, relative", e.radius, splat.radius, 1e-5, 0.0);
         }
         assert!(visible > 1500, "{visible}");
-        worst.tell("project");
+        worst.report("project");
         mismatches.finish("project");
     }
 }
@@ -177,7 +177,7 @@ fn rasterize_in_both_directions_on_the_splats_of_the_reference() {
     let (mut mismatches, mut worst) = (Mismatches::default(), Worst::default());
     let tolerances = Tolerances { color: 1e-5, gradient: 1e-3, screen: 1e-3, ..Tolerances::of(Path::Gpu) };
     expected.compare(&seen_on_gpu(actual), tolerances, &mut mismatches, &mut worst);
-    worst.tell("rasterize");
+    worst.report("rasterize");
     mismatches.finish("rasterize");
 }
 
@@ -422,7 +422,7 @@ fn views_drawn_in_bands_are_those_drawn_at_once() {
 
 /// Without a wait in between: what does not fit is not drawn, and the counts say so.
 #[test]
-fn a_view_that_does_not_fit_is_told_and_leaves_no_gradient() {
+fn a_view_that_does_not_fit_is_reported_and_leaves_no_gradient() {
     let Some(device) = device() else { return };
     let scene = generate(&config());
     let settings = RenderSettings { instances: None, ..settings() };

@@ -884,7 +884,7 @@ fn shapes() -> impl Strategy<Value = Shape> {
     prop::sample::select(vec![Shape::Needle, Shape::Pancake, Shape::Pixel, Shape::Wide])
 }
 
-/// Strengths at and beside every threshold, and at both ends.
+/// Strengths at and next to every threshold, and at both ends.
 fn strengths() -> impl Strategy<Value = f32> {
     prop::sample::select(vec![
         0.0,

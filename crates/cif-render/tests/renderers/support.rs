@@ -247,7 +247,7 @@ impl Worst {
         }
     }
 
-    pub(crate) fn tell(&self, name: &str) {
+    pub(crate) fn report(&self, name: &str) {
         for (what, worst) in &self.0 {
             println!("{name}: worst {what} {worst:.1e}");
         }

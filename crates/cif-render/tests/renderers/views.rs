@@ -246,7 +246,7 @@ fn check_within(
         let name = format!("{name}, {:?}", actual.path);
         let (mut mismatches, mut worst) = (Mismatches::default(), Worst::default());
         expected.compare(&actual, tolerances(actual.path), &mut mismatches, &mut worst);
-        worst.tell(&name);
+        worst.report(&name);
         mismatches.finish(&name);
     }
 }

@@ -2,8 +2,8 @@
 //!
 //! A node keeps one opacity and one colour per splat, which stand wherever only one time is read: the mean opacity
 //! over the times at which the node is visible (while any of its Gaussians can be drawn), and the colour at the first
-//! time. Where the trained ones leave them by more than [`crate::SceneOptions::appearance_tolerance`], samples stand
-//! beside them, no more than linear interpolation needs to stay inside the tolerance.
+//! time. Where the trained ones leave them by more than [`crate::SceneOptions::appearance_tolerance`], samples are
+//! added to them, no more than linear interpolation needs to stay inside the tolerance.
 
 pub(crate) mod blur;
 pub(crate) mod visibility;
@@ -226,8 +226,8 @@ pub fn lost_without_samples(node: &Node) -> Vec<String> {
         ("opacities", "their mean", &node.appearance.opacities, &splats.opacities),
         ("colours", "those of the first frame", &node.appearance.colors, &splats.sh_coefficients),
     ];
-    let told = kinds.into_iter().filter(|(_, _, samples, _)| !samples.is_empty());
-    told.map(|(what, instead, samples, constant)| {
+    let changing = kinds.into_iter().filter(|(_, _, samples, _)| !samples.is_empty());
+    changing.map(|(what, instead, samples, constant)| {
         let stride = (constant.len() / splats.len().max(1)).max(1);
         let (mut squares, mut weights, mut largest) = (0.0_f64, 0.0_f64, 0.0_f32);
         for sample in samples {

@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn white_is_told_by_the_range() {
+    fn white_is_known_from_the_range() {
         let mut warnings = Vec::new();
         assert_eq!(color_range([0.0, 1.0, 1.2], "a", &mut warnings), 1.0);
         assert!(warnings.is_empty());

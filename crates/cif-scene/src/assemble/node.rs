@@ -12,7 +12,7 @@ use crate::graph::{
 use crate::naming;
 use crate::shape::extent;
 
-/// The node; its frames are still to be told.
+/// The node; its frames are still to be set.
 pub(super) fn node(mut prim: Prim, kind: NodeKind, name: String) -> Node {
     let appearance = appearance(&mut prim);
     let poses = prim.track.clone().poses(prim.keeps_pose);

@@ -76,7 +76,7 @@ impl Default for Prims {
 /// Treatment of objects that repeat the id of another.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Copies {
-    /// They keep id and name; a warning tells which one is the copy.
+    /// They keep id and name; a warning says which one is the copy.
     #[default]
     Keep,
     /// They become instances of their own.
@@ -144,7 +144,7 @@ pub struct Prim {
     pub source_frames: Option<(usize, usize)>,
     /// As recorded; computed where it is not.
     pub mean_occupancy: Option<f32>,
-    /// Motion report of the export; it counts as long as the motion model is the one that it tells of.
+    /// Motion report of the export; it counts as long as the motion model is the one that it describes.
     pub report: Option<MotionReport>,
 }
 

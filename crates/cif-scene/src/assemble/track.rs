@@ -56,7 +56,7 @@ impl Track {
     }
 }
 
-/// Successive rotations in one hemisphere, so that what is between them takes the shorter way.
+/// Successive rotations in one hemisphere, so that what is between them takes the shorter arc.
 pub fn one_hemisphere(samples: &mut [PoseSample]) {
     keys::one_hemisphere(samples);
 }

@@ -1,4 +1,4 @@
-//! Cameras that differ. They say how the scene was captured: edits of them are told, never applied.
+//! Cameras that differ. They say how the scene was captured: edits of them are reported, never applied.
 
 use std::collections::BTreeMap;
 use std::fmt;

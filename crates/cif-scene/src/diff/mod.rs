@@ -147,7 +147,7 @@ pub struct SceneDiff {
     pub objects: Vec<ObjectChange>,
     /// Objects that do not.
     pub unchanged: usize,
-    /// Cameras that differ. They are told only: cameras of a scene are those of its capture.
+    /// Cameras that differ. They are only reported: cameras of a scene are those of its capture.
     pub cameras: Vec<CameraChange>,
 }
 

@@ -11,7 +11,7 @@ pub struct Pair {
     pub before: Option<usize>,
     /// In the second graph; `None` for a removed node.
     pub after: Option<usize>,
-    /// True when the node of the second graph is a copy beside the original.
+    /// True when the node of the second graph is a copy next to the original.
     pub duplicate: bool,
 }
 

@@ -74,7 +74,7 @@ pub(crate) struct SplatPairs {
     pub(crate) added: Vec<usize>,
 }
 
-/// Pairs splats by row, or by position where rows tell nothing.
+/// Pairs splats by row, or by position where rows say nothing.
 pub(crate) fn pair(first: &Node, second: &Node, same_rows: bool) -> SplatPairs {
     let mut result = SplatPairs::default();
     let (a, b) = (&first.splats, &second.splats);

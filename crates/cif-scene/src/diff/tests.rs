@@ -17,7 +17,7 @@ fn a_graph_does_not_differ_from_itself() {
 }
 
 #[test]
-fn differences_are_told_in_words_and_numbers() {
+fn differences_are_reported_in_words_and_numbers() {
     let before = build(&recorded_field(4, 7), &SceneOptions::default()).unwrap();
     let mut after = before.clone();
     after.nodes[0].pivot += DVec3::new(0.06, 0.0, 0.08);
@@ -45,7 +45,7 @@ fn differences_are_told_in_words_and_numbers() {
 }
 
 #[test]
-fn cameras_that_differ_are_told_and_are_no_edit() {
+fn cameras_that_differ_are_reported_and_are_no_edit() {
     let mut field = learned_field(2, 7);
     let first = field.cameras[0].clone();
     for (name, times) in [("left", 0..2), ("right", 0..1), ("gone", 0..1), ("zoomed", 0..1)] {

@@ -14,8 +14,8 @@ pub(super) type Owner = Option<u16>;
 pub(super) enum RowIdentity {
     /// The row of this number of the gathered base.
     Kept(u32),
-    /// Its owner is told.
-    Told(Owner),
+    /// Its owner is given.
+    Given(Owner),
 }
 
 /// The table without what was removed, and rows that name only what is left. `instances` is the base's table
@@ -49,7 +49,7 @@ pub(super) fn rebuild(
     let mut identities = Identities::empty();
     for row in rows {
         match (*row, gathered) {
-            (RowIdentity::Told(owner), _) => {
+            (RowIdentity::Given(owner), _) => {
                 identities.push_certain(owner.and_then(|owner| renumbered[usize::from(owner)]));
             }
             (RowIdentity::Kept(_), None) => identities.push_certain(None),

@@ -104,7 +104,7 @@ pub fn apply(
     Ok((field, changes))
 }
 
-/// The field on its way.
+/// The field under construction.
 struct Work {
     field: Field,
     tracks: Tracks,
@@ -237,7 +237,7 @@ impl Work {
         let id = owner.map(|index| self.instances.entries[usize::from(index)].id);
         if step.pair.duplicate {
             let copies = step.first_copy..step.first_copy + step.splats.kept.len() as u32;
-            self.rows[copies.start as usize..copies.end as usize].fill(RowIdentity::Told(owner));
+            self.rows[copies.start as usize..copies.end as usize].fill(RowIdentity::Given(owner));
             // Not in the groups of the original.
             let is_named = |group: usize| self.tracks.groups[group].instance.is_some();
             let named: Vec<u32> =
@@ -265,7 +265,7 @@ impl Work {
             }
             self.field.sh_degree = degree;
         }
-        self.rows.extend(std::iter::repeat_n(RowIdentity::Told(owner), rows.gaussians.len()));
+        self.rows.extend(std::iter::repeat_n(RowIdentity::Given(owner), rows.gaussians.len()));
         // Groups of an instance that the network moves are not all of it.
         let is_named = is_new || self.tracks.groups.iter().any(|group| group.instance == id);
         rows.append_to(&mut self.field.gaussians, &mut self.tracks, id.filter(|_| is_named));

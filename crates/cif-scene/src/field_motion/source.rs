@@ -6,7 +6,7 @@ use cif_render::cpu::{Renderer, SimdLevel};
 /// Gives the Gaussians of a field at a time. Rows keep their order and number.
 pub trait MotionSource {
     /// All Gaussians at a normalised time in [0, 1], raw form, deformation added. Gaussians that are hidden at the
-    /// time are given as if they were not: visibility is told apart from motion.
+    /// time are given as if they were not: visibility is kept apart from motion.
     fn gaussians_at(&mut self, time: f64) -> Gaussians;
 
     /// True when anything can move at all.

@@ -176,7 +176,7 @@ fn needed_shares(field: &Field, visible: &[u32], candidates: &[Option<Identity>]
     members.iter().map(|members| overlap::bound(members).max(LEAST_SHARE)).collect()
 }
 
-/// Occupancies of the visible rows, or opacities where occupancy tells nothing.
+/// Occupancies of the visible rows, or opacities where occupancy says nothing.
 fn occupancies(field: &Field, visible: &[u32]) -> Vec<f32> {
     let sigmoid_of = |logits: &[f32]| -> Vec<f32> {
         visible.iter().map(|&row| direct_sigmoid(logits[row as usize])).collect()
@@ -222,10 +222,10 @@ fn enclose(
             let (bounds, point) = (boxes[index], points[position]);
             let held = (0..3).all(|axis| (bounds.low[axis]..=bounds.high[axis]).contains(&point[axis]));
             held.then(|| {
-                let wanted = std::num::NonZero::new(NEIGHBOURS + 1).expect("more than zero neighbours");
+                let nearest = std::num::NonZero::new(NEIGHBOURS + 1).expect("more than zero neighbours");
                 let neighbours = tree
                     .query(&point)
-                    .nearest_n::<SquaredEuclidean<f64>>(wanted)
+                    .nearest_n::<SquaredEuclidean<f64>>(nearest)
                     .execute()
                     .into_iter()
                     .map(|found| found.item as usize)
@@ -266,14 +266,14 @@ mod tests {
         let mut field = recorded_field(2, 5);
         field.tracks.as_mut().unwrap().groups.iter_mut().for_each(|group| group.deformed = false);
         // A shadow on the ground that the masks give to the first object, and pieces of it that they do not.
-        let (shadow, piece, stray, told) = (2 * MEMBERS + 3, 5, 6, 2 * MEMBERS + 4);
+        let (shadow, piece, stray, given) = (2 * MEMBERS + 3, 5, 6, 2 * MEMBERS + 4);
         let mut rows = Identities::empty();
         for row in 0..field.len() {
             match row {
                 _ if row == shadow => rows.push(Owner::Estimated, &[(0, 0.9)]),
                 _ if row == piece => rows.push(Owner::Estimated, &[(0, 0.01)]),
                 _ if row == stray => rows.push(Owner::Estimated, &[(1, 0.9)]),
-                _ if row == told => rows.push(Owner::Instance(0), &[(0, 0.9)]),
+                _ if row == given => rows.push(Owner::Instance(0), &[(0, 0.9)]),
                 _ if row < 2 * MEMBERS => rows.push(Owner::Estimated, &[((row / MEMBERS) as u16, 0.9)]),
                 _ => rows.push(Owner::Estimated, &[(0, 0.01)]),
             }
@@ -285,7 +285,7 @@ mod tests {
             |field: &Field| assign(field, &most_probable(field), &all, &SceneOptions::default()).owners;
         let owner = |row: usize| Some(row / MEMBERS).filter(|owner| *owner < 2);
         let expected: Vec<_> =
-            (0..field.len()).map(|row| if row == told { Some(0) } else { owner(row) }).collect();
+            (0..field.len()).map(|row| if row == given { Some(0) } else { owner(row) }).collect();
         assert_eq!(owners(&field), expected);
         // A group without Gaussians is nothing of its instance.
         let tracks = field.tracks.as_mut().unwrap();

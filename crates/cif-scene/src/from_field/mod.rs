@@ -261,14 +261,14 @@ fn without_splats(
     visible: &[u32],
 ) -> String {
     let hidden = hidden_rows(field, identities, visible);
-    let told: Vec<String> = omitted
+    let names: Vec<String> = omitted
         .iter()
         .map(|index| match hidden[*index] {
             0 => field.instances[*index].label.clone(),
             count => format!("{} ({count} are too faint to be drawn)", field.instances[*index].label),
         })
         .collect();
-    format!("{NO_SPLATS}{}", told.join(", "))
+    format!("{NO_SPLATS}{}", names.join(", "))
 }
 
 /// Per instance, how many Gaussians are most probably its own and cannot be drawn.
@@ -282,7 +282,7 @@ fn hidden_rows(field: &Field, identities: &[Option<Identity>], visible: &[u32]) 
     hidden
 }
 
-/// Hulls for simulators; told where there is no body to make one of.
+/// Hulls for simulators; reported where there is no body to make one of.
 fn add_colliders(node: &mut Node, options: &SceneOptions, warnings: &mut Vec<String>) {
     let hulls = match node.kind {
         NodeKind::Instance { .. } => options.hulls_per_instance,

@@ -24,8 +24,8 @@ const TRIED_PARTITIONS: usize = 3;
 const PROMISING: f64 = 1.2;
 /// Residual of parts over that of one rigid body above which parts are not worth having.
 const WORTH: f64 = 0.98;
-/// Where the best parts miss the tolerance, those that move by less than this share of it rest: beside what the
-/// model misses, such motion would be made up.
+/// Where the best parts miss the tolerance, those that move by less than this share of it are at rest: compared with
+/// what the model misses, such motion would be made up.
 const UNSHOWN: f64 = 0.5;
 /// Tolerances within which what stands still in a picture is at rest.
 const RESTING: f64 = 5.0;
@@ -229,9 +229,9 @@ fn decide(group: &MovingGroup, parts: &Option<FittedParts>, options: &SceneOptio
         let moves = group.is_loose && group.static_residual.statistics().max > group.tolerance;
         return if moves { MotionModel::Dense } else { MotionModel::Static };
     }
-    let rests =
+    let is_at_rest =
         group.stands_still && group.static_residual.statistics().decisive <= RESTING * group.tolerance;
-    if rests || inside(group, &group.static_residual) || limit == MotionModel::Static {
+    if is_at_rest || inside(group, &group.static_residual) || limit == MotionModel::Static {
         return MotionModel::Static;
     }
     if inside(group, &group.rigid_residual) || limit == MotionModel::Rigid {

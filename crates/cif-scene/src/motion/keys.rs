@@ -19,7 +19,7 @@ use crate::graph::pose_at;
 /// Part of the slack that samples may use up; the rest is for rounding to single precision.
 const USED_SLACK: f64 = 0.999;
 
-/// Weighted mean and covariance of a shape, which tell how far apart two poses put it.
+/// Weighted mean and covariance of a shape, which determine how far apart two poses put it.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Moments {
     mean: DVec3,
@@ -68,7 +68,7 @@ pub fn allowances(residuals: &[TimeResidual], tolerance: f64) -> Vec<f64> {
 }
 
 /// Ascending positions of `count` samples that suffice: the first, the last, and between them as few as
-/// stepping as far as possible each time gives. `fits(first, last)` tells whether all samples between two kept
+/// stepping as far as possible each time gives. `fits(first, last)` says whether all samples between two kept
 /// ones may go; it is asked for neighbours too, but they always fit.
 #[must_use]
 pub fn kept(count: usize, mut fits: impl FnMut(usize, usize) -> bool) -> Vec<usize> {
@@ -190,7 +190,7 @@ mod tests {
 
     #[test]
     fn more_than_half_a_turn_is_not_cut_short() {
-        // 3 turns in 30 steps: the short way between far samples would lose turns.
+        // 3 turns in 30 steps: the shorter arc between far samples would lose turns.
         let track: Vec<PoseSample> = (0..31)
             .map(|k| sample(k, DVec3::ZERO, DQuat::from_rotation_z(0.2 * std::f64::consts::PI * k as f64)))
             .collect();

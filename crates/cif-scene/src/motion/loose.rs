@@ -1,4 +1,4 @@
-//! Splats that move or deform as far as a picture shows, told from those that stand still.
+//! Splats that move or deform as far as a picture shows, as distinguished from those that stand still.
 //!
 //! A network trembles a little where nothing moves. An instance whose splats do no more than that is at rest, though
 //! the tolerance of motion be tighter by some factor. Most of a background stands still too; but shadows, reflections

@@ -2,9 +2,9 @@
 //!
 //! Every part is a rigid motion. A Gaussian fits a part as well as it stands still in the part's moving frame:
 //! its cost is the RMS distance, over time, from its own mean place there, so that no shape has to be known.
-//! Parts are found one after the other: the worst part is split in several ways (by the main mode of its
+//! Parts are found one after the other: the worst part is split by several criteria (by the main mode of its
 //! residuals, by their size, and across the axes of its shape), all parts are refined by alternating between
-//! fitting motions and choosing parts, and the best way is kept. Gaussians that several parts fit equally well
+//! fitting motions and choosing parts, and the best split is kept. Gaussians that several parts fit equally well
 //! follow their neighbours, so that parts hang together.
 //!
 //! Nothing is drawn at random. Outliers weigh in by the kernel of [`cif_geometry::align::procrustes`]; they make no parts
@@ -112,12 +112,12 @@ pub fn partitions(
     found
 }
 
-/// `wanted` of `count` positions at most, evenly spread, ends included.
-fn spread(count: usize, wanted: usize) -> Vec<usize> {
-    if count <= wanted {
+/// At most `limit` of `count` positions, evenly spread, ends included.
+fn spread(count: usize, limit: usize) -> Vec<usize> {
+    if count <= limit {
         return (0..count).collect();
     }
-    (0..wanted).map(|k| k * (count - 1) / (wanted - 1)).collect()
+    (0..limit).map(|k| k * (count - 1) / (limit - 1)).collect()
 }
 
 impl Paths {
@@ -374,12 +374,12 @@ fn follow_neighbours(points: &[DVec3], costs: &[Vec<f64>], tolerance: f64, label
     let coordinates: Vec<[f64; 3]> = points.iter().map(|point| point.to_array()).collect();
     // Only degenerate point sets (thousands of equal centres) have no tree.
     let Ok(tree) = ImmutableKdTree::<f64, 3>::new_from_slice(&coordinates) else { return };
-    let wanted = std::num::NonZero::new(NEIGHBOURS + 1).expect("more than zero neighbours");
+    let nearest = std::num::NonZero::new(NEIGHBOURS + 1).expect("more than zero neighbours");
     let neighbours: Vec<Vec<usize>> = coordinates
         .iter()
         .enumerate()
         .map(|(k, point)| {
-            let found = tree.query(point).nearest_n::<SquaredEuclidean<f64>>(wanted).execute();
+            let found = tree.query(point).nearest_n::<SquaredEuclidean<f64>>(nearest).execute();
             found.into_iter().map(|found| found.item as usize).filter(|&other| other != k).collect()
         })
         .collect();

@@ -21,7 +21,7 @@ use crate::graph::{
 const ROUNDING: f64 = 1e-9;
 
 /// The rigid groups that the rows of an instance (a dense index) are of, ascending; none where some row is of no such
-/// group, where the groups do not move, and where their motion is more than the options allow. `instance_of` tells the
+/// group, where the groups do not move, and where their motion is more than the options allow. `instance_of` gives the
 /// instance of every group.
 pub(crate) fn groups_of(
     field: &Field,

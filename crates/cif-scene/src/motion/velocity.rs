@@ -31,7 +31,7 @@ impl Node {
         }
         let (a, b) = (pose_at(track, self.pivot, start), pose_at(track, self.pivot, end));
         let turn = b.rotation * a.rotation.inverse();
-        // Of the two quaternions of a rotation, the one with the shorter way.
+        // Of the two quaternions of a rotation, the one with the shorter arc.
         let turn = if turn.w < 0.0 { -turn } else { turn };
         let centre = self.centre_of_mass(at);
         let place = |pose: &PoseSample| pose.rotation * centre + pose.translation;

@@ -4,7 +4,7 @@
 //! nearest splats at the first time, each moving the point by its own pose. First times are eight, spread evenly over
 //! those at which the instance was seen, and other times are all others at which it was. At times at which it was not
 //! seen nobody can know where it is, so they do not count. Rotations of symmetric objects are not excused: their
-//! followed points tell them apart.
+//! followed points distinguish them.
 //!
 //! | module | answers |
 //! |---|---|

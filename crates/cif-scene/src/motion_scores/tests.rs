@@ -131,7 +131,7 @@ fn a_still_graph_leaves_the_whole_path_unexplained() {
 }
 
 #[test]
-fn rotations_that_are_missed_are_told_in_degrees() {
+fn rotations_that_are_missed_are_reported_in_degrees() {
     let turn =
         |angle: f64| RigidTransform { rotation: DMat3::from_rotation_z(angle), ..RigidTransform::IDENTITY };
     let graph = graph(&corners(), 1e-9, Motion::Static, 2);

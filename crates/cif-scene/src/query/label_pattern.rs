@@ -38,7 +38,7 @@ impl LabelPattern {
                     at += 1;
                     star = Some((at, next));
                 }
-                Some(&wanted) if wanted == '?' || wanted == label[next] => {
+                Some(&expected) if expected == '?' || expected == label[next] => {
                     at += 1;
                     next += 1;
                 }
@@ -91,20 +91,20 @@ mod tests {
     fn a_hundred_thousand_stars_are_one() {
         let stars = "*".repeat(100_000);
         assert_eq!(LabelPattern::new(&stars), LabelPattern::new("*"));
-        // What would take exponential time by trying every way: answered at once.
+        // What would take exponential time by trying every split: answered at once.
         let pattern = LabelPattern::new(&"a*".repeat(200));
         assert!(!pattern.matches(&format!("{}b", "a".repeat(150))));
         assert!(pattern.matches(&"a".repeat(400)));
     }
 
-    /// By trying every way.
+    /// By trying every split.
     fn naive(pattern: &[char], label: &[char]) -> bool {
         match pattern.split_first() {
             None => label.is_empty(),
             Some(('*', rest)) => (0..=label.len()).any(|taken| naive(rest, &label[taken..])),
-            Some((wanted, rest)) => label
-                .split_first()
-                .is_some_and(|(first, others)| (*wanted == '?' || wanted == first) && naive(rest, others)),
+            Some((expected, rest)) => label.split_first().is_some_and(|(first, others)| {
+                (*expected == '?' || expected == first) && naive(rest, others)
+            }),
         }
     }
 
@@ -115,7 +115,7 @@ mod tests {
         }
 
         #[test]
-        fn matches_are_those_of_trying_every_way(pattern in "[ab*?]{0,8}", label in "[ab]{0,8}") {
+        fn matches_are_those_of_trying_every_split(pattern in "[ab*?]{0,8}", label in "[ab]{0,8}") {
             let characters = |text: &str| text.chars().collect::<Vec<char>>();
             let expected = naive(&characters(&pattern), &characters(&label));
             prop_assert_eq!(LabelPattern::new(&pattern).matches(&label), expected);

@@ -87,7 +87,7 @@ impl ObjectQuery {
     /// True when labels of a taxonomy count.
     #[must_use]
     pub fn counts(&self, taxonomy: &str) -> bool {
-        self.taxonomy.as_deref().is_none_or(|wanted| wanted == taxonomy)
+        self.taxonomy.as_deref().is_none_or(|requested| requested == taxonomy)
     }
 
     /// True when a world box is where the query looks.
@@ -157,18 +157,18 @@ pub fn volume(hulls: f64, bounds: &Bounds) -> (Option<f64>, Option<VolumeOf>) {
 /// When no node carries the label at all.
 pub fn search(
     graph: &SceneGraph,
-    wanted: &ObjectQuery,
+    query: &ObjectQuery,
     place: &str,
     path: impl Fn(&str) -> String,
 ) -> Result<Vec<ObjectMatch>, QueryError> {
-    let nodes = labelled(graph, wanted, place)?;
+    let nodes = labelled(graph, query, place)?;
     let codes = &graph.time_codes;
-    let sampled = sampled_codes(wanted.when, codes.start(), codes.end());
-    let at = match wanted.when {
+    let sampled = sampled_codes(query.when, codes.start(), codes.end());
+    let at = match query.when {
         When::Default => codes.start(),
         When::At(code) | When::Over(code, _) => code,
     };
-    Ok(nodes.into_iter().filter_map(|node| describe(graph, node, wanted, at, &sampled, &path)).collect())
+    Ok(nodes.into_iter().filter_map(|node| describe(graph, node, query, at, &sampled, &path)).collect())
 }
 
 /// Nodes that carry the label of a query, in the order of the graph; `place` names the scene in errors.
@@ -177,15 +177,15 @@ pub fn search(
 /// When no node carries the label.
 pub(super) fn labelled<'a>(
     graph: &'a SceneGraph,
-    wanted: &ObjectQuery,
+    query: &ObjectQuery,
     place: &str,
 ) -> Result<Vec<&'a Node>, QueryError> {
-    let label_query = wanted.label_query();
+    let label_query = query.label_query();
     let matcher = label_query.as_ref().map(LabelQuery::matcher);
     let (mut known, mut found) = (Vec::new(), Vec::new());
     for node in &graph.nodes {
         let names: Vec<&String> =
-            all_names(node).filter_map(|(taxonomy, name)| wanted.counts(taxonomy).then_some(name)).collect();
+            all_names(node).filter_map(|(taxonomy, name)| query.counts(taxonomy).then_some(name)).collect();
         if names.iter().any(|name| matcher.as_ref().is_none_or(|pattern| pattern.matches(name))) {
             found.push(node);
         }
@@ -207,12 +207,12 @@ fn all_names(node: &Node) -> impl Iterator<Item = (&str, &String)> {
 fn describe(
     graph: &SceneGraph,
     node: &Node,
-    wanted: &ObjectQuery,
+    query: &ObjectQuery,
     at: f64,
     sampled: &[f64],
     path: impl Fn(&str) -> String,
 ) -> Option<ObjectMatch> {
-    let over = matches!(wanted.when, When::Over(..));
+    let over = matches!(query.when, When::Over(..));
     let visible: Vec<f64> = if over { sampled.to_vec() } else { vec![at] }
         .into_iter()
         .filter(|code| node.is_visible(*code))
@@ -220,11 +220,11 @@ fn describe(
     let boxes = node.boxes();
     let bounds = visible.iter().fold(Bounds::EMPTY, |all, code| all.union(boxes.world(*code)));
     let bounds = world::world_bounds(&graph.frame, bounds);
-    if visible.is_empty() || !wanted.is_at(&bounds) {
+    if visible.is_empty() || !query.is_at(&bounds) {
         return None;
     }
     let world_per_unit = 1.0 / graph.frame.scale;
-    let way: Vec<DVec3> = sampled.iter().map(|code| node.world_transform(*code).translation).collect();
+    let positions: Vec<DVec3> = sampled.iter().map(|code| node.world_transform(*code).translation).collect();
     let (volume, volume_of) = volume(hull_volume(&node.colliders) * world_per_unit.powi(3), &bounds);
     let (low, high) = query::corners(&bounds);
     Some(ObjectMatch {
@@ -239,7 +239,7 @@ fn describe(
         },
         volume,
         volume_of,
-        speed: speed(sampled, &way, graph.time_codes.frames_per_second) * world_per_unit,
+        speed: speed(sampled, &positions, graph.time_codes.frames_per_second) * world_per_unit,
         names: all_names(node).map(|(_, name)| name.clone()).collect(),
         embedding: node.embedding.clone(),
     })

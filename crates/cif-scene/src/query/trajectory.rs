@@ -46,10 +46,10 @@ pub struct TrajectorySample {
 /// When no node carries the label.
 pub fn trajectories(
     graph: &SceneGraph,
-    wanted: &ObjectQuery,
+    query: &ObjectQuery,
     place: &str,
 ) -> Result<Vec<Trajectory>, QueryError> {
-    let nodes = labelled(graph, wanted, place)?;
+    let nodes = labelled(graph, query, place)?;
     Ok(nodes.into_iter().map(|node| of_node(graph, node)).collect())
 }
 
@@ -113,8 +113,8 @@ mod tests {
             VisibilitySample { time_code: 3.5, visible: false },
         ];
         let label = node.label.clone();
-        let wanted = ObjectQuery { label: Some(label), ..ObjectQuery::default() };
-        let found = trajectories(&graph, &wanted, "here").unwrap();
+        let query = ObjectQuery { label: Some(label), ..ObjectQuery::default() };
+        let found = trajectories(&graph, &query, "here").unwrap();
         assert_eq!(found.len(), 1);
         let samples = &found[0].samples;
         let of = |take: &dyn Fn(&TrajectorySample) -> f64| samples.iter().map(take).collect::<Vec<_>>();
@@ -138,8 +138,8 @@ mod tests {
         let all = trajectories(&graph, &ObjectQuery::default(), "here").unwrap();
         assert_eq!(all.len(), graph.nodes.len());
         assert!(all.iter().all(|one| one.samples.len() == graph.time_codes.samples.len()));
-        let wanted = ObjectQuery { label: Some("teapot".to_owned()), ..ObjectQuery::default() };
-        let error = trajectories(&graph, &wanted, "here").unwrap_err().to_string();
+        let query = ObjectQuery { label: Some("teapot".to_owned()), ..ObjectQuery::default() };
+        let error = trajectories(&graph, &query, "here").unwrap_err().to_string();
         assert!(error.contains("teapot") && error.contains(&graph.nodes[0].label), "{error}");
     }
 }

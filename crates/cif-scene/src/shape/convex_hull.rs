@@ -91,9 +91,9 @@ impl HullMesh {
                     .fold(0.0, f64::max)
             })
             .collect();
-        let wanted = weighted_quantile(&factors, weights, share);
-        if wanted > 1.0 {
-            let factor = wanted * (1.0 + 1e-6);
+        let needed = weighted_quantile(&factors, weights, share);
+        if needed > 1.0 {
+            let factor = needed * (1.0 + 1e-6);
             for point in &mut self.points {
                 *point = middle + factor * (*point - middle);
             }

@@ -41,7 +41,7 @@ pub fn splat_bounds(target_from_local: &RigidTransform, splats: &Splats, range: 
     ellipsoid_bounds(target_from_local, means, orientations, &splats.scales[range])
 }
 
-/// As [`ellipsoid_bounds`], of the splats of a node; `node_from_part` tells where its parts are.
+/// As [`ellipsoid_bounds`], of the splats of a node; `node_from_part` gives where its parts are.
 #[must_use]
 pub fn node_bounds(
     target_from_local: &RigidTransform,

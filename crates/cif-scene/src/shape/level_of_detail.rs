@@ -39,8 +39,8 @@ pub fn level_of_detail(node: &Node, share: f64) -> Vec<u32> {
         });
         order = [best, rest].concat();
     }
-    let wanted = (share.clamp(0.0, 1.0) * order.len() as f64).ceil() as usize;
-    order.truncate(wanted.max(kept_first));
+    let count = (share.clamp(0.0, 1.0) * order.len() as f64).ceil() as usize;
+    order.truncate(count.max(kept_first));
     order.sort_unstable();
     order
 }

@@ -22,7 +22,7 @@ use cif_geometry::stats::weighted_quantile;
 pub const DENSITY: f64 = 300.0;
 /// Least mass of a collider, kg; chosen: contacts of lighter things are stiff in simulators.
 pub const LEAST_MASS: f64 = 1e-3;
-/// Most cells of the grid along the longest side; chosen, fine enough to tell a mug from its hull.
+/// Most cells of the grid along the longest side; chosen, fine enough to distinguish a mug from its hull.
 const MOST_CELLS: f64 = 24.0;
 /// Fewest cells along the longest side: one inside, and one on each side of it.
 const FEWEST_CELLS: f64 = 3.0;

@@ -155,11 +155,11 @@ fn what_passes_over_an_instance_at_rest_leaves_with_the_moving_background() {
     };
     let node = |name: &str, model: MotionModel, splats: usize| (name.to_owned(), model, splats);
     let at_most = |model| SceneOptions { most_expensive_motion: model, ..SceneOptions::default() };
-    let (usual, parts, rigid) =
+    let (defaults, parts, rigid) =
         (SceneOptions::default(), at_most(MotionModel::Parts), at_most(MotionModel::Rigid));
     let whole = node("red_mug_001", MotionModel::Static, 60);
     // A shadow of two splats, which moves as it was trained.
-    let shadow = nodes(&passing(10..12, 3.0), &usual);
+    let shadow = nodes(&passing(10..12, 3.0), &defaults);
     assert!(shadow.contains(&node("red_mug_001", MotionModel::Static, 58)), "{shadow:?}");
     assert!(shadow.contains(&node("background_moving", MotionModel::Dense, 2)), "{shadow:?}");
     // A few may each have a path of their own even where nothing else may: grown, and turned, as they were trained.
@@ -176,12 +176,12 @@ fn what_passes_over_an_instance_at_rest_leaves_with_the_moving_background() {
     assert_eq!((shadow.model(), shadow.splats.len()), (MotionModel::Dense, 3));
     assert!(shadow.report.residual.max < 1e-6, "{:?}", shadow.report.residual);
     // No more than trembles, or where nothing but bodies may move, they stay with the instance.
-    let trembling = nodes(&passing(10..12, 0.01), &usual);
+    let trembling = nodes(&passing(10..12, 0.01), &defaults);
     assert!(trembling.contains(&whole), "{trembling:?}");
     let frozen = nodes(&passing(10..12, 3.0), &rigid);
     assert!(frozen.contains(&whole), "{frozen:?}");
     // So many are a part that moves.
-    let part = nodes(&passing(10..30, 3.0), &usual);
+    let part = nodes(&passing(10..30, 3.0), &defaults);
     assert!(part.iter().all(|(name, _, splats)| name != "red_mug_001" || *splats == 60), "{part:?}");
 }
 
@@ -206,7 +206,7 @@ fn noise_inside_the_tolerance_is_static_and_averaged() {
     let limited = SceneOptions { most_expensive_motion: MotionModel::Rigid, ..strict };
     let graph = build_from(&field, &mut source, &limited).unwrap();
     assert_eq!(graph.nodes[0].model(), MotionModel::Rigid);
-    assert!(graph.nodes[0].report.residual.decisive > 1e-4, "the loss is told");
+    assert!(graph.nodes[0].report.residual.decisive > 1e-4, "the loss is reported");
 }
 
 #[test]
@@ -308,7 +308,7 @@ fn untrained_occupancy_falls_back_to_opacity() {
 }
 
 #[test]
-fn unusable_gaussians_are_left_out_and_told() {
+fn unusable_gaussians_are_left_out_and_reported() {
     let mut field = field(1);
     field.gaussians.means[0][1] = f32::NAN;
     field.gaussians.log_scales[1][0] = f32::NAN;

@@ -144,7 +144,7 @@ fn a_standing_base_needs_no_samples_at_all() {
 }
 
 #[test]
-fn without_dense_motion_the_best_parts_leave_and_the_loss_is_told() {
+fn without_dense_motion_the_best_parts_leave_and_the_loss_is_reported() {
     let field = field(1);
     let source = |time: f64| {
         let mut gaussians = moved(&field, 0..60, &pose(time));
@@ -171,7 +171,7 @@ fn without_dense_motion_the_best_parts_leave_and_the_loss_is_told() {
     assert_eq!([rigid.0, two.0, eight.0], [MotionModel::Rigid, MotionModel::Parts, MotionModel::Parts]);
     assert_eq!(dense.0, MotionModel::Dense);
     assert!(two.1 < 0.8 * rigid.1 && eight.1 < 0.7 * two.1, "{rigid:?} {two:?} {eight:?}");
-    assert!(eight.1 > eight.2, "the loss is told");
+    assert!(eight.1 > eight.2, "the loss is reported");
     assert!(dense.1 <= dense.2, "{dense:?}");
 }
 
@@ -206,7 +206,10 @@ fn parts_that_hardly_move_rest_where_the_model_misses_the_tolerance() {
         let node = &graph.nodes[0];
         assert!(node.report.residual.decisive > node.report.tolerance, "{:?}", node.report);
         let found = decisive(&graph, node, &source);
-        assert!((found - node.report.residual.decisive).abs() < 0.1 * found, "what resting costs is told");
+        assert!(
+            (found - node.report.residual.decisive).abs() < 0.1 * found,
+            "the error of standing still is reported"
+        );
         let Motion::Parts(motion) = &node.motion else { panic!("{:?}", node.report) };
         for part in &motion.parts {
             let still = part.track.iter().all(|pose| {

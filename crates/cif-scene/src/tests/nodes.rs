@@ -1,4 +1,4 @@
-//! Properties of nodes beside their motion: colliders, levels of detail, velocities, visibility.
+//! Properties of nodes other than their motion: colliders, levels of detail, velocities, visibility.
 
 use super::*;
 use cif_field::tracks::{NO_GROUP, Samples, TrackGroup, TrackPose};
@@ -299,7 +299,7 @@ fn fading_nodes_hide_and_come_back() {
     assert!(
         (first.splats.opacities[0] - mean).abs() < 1e-6 && (first.splats.opacities[40] - 0.8).abs() < 1e-6
     );
-    // Samples stand beside the means, as few as a step needs.
+    // Samples are kept in addition to the means, as few as a step needs.
     let codes = |node: &Node| -> Vec<f64> {
         node.appearance.opacities.iter().map(|sample| sample.time_code).collect()
     };
@@ -315,7 +315,7 @@ fn fading_nodes_hide_and_come_back() {
     let whole = SceneOptions { reduce_keys: false, ..SceneOptions::default() };
     let graph = build_from(&field, &mut source, &whole).unwrap();
     assert_eq!(graph.nodes[0].appearance.opacities.len(), FRAMES);
-    // What formats without samples are told.
+    // The loss that formats without samples report.
     let lost = crate::appearance::lost_without_samples(&graph.nodes[0]);
     assert_eq!(lost.len(), 1);
     assert!(

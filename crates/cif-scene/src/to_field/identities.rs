@@ -66,7 +66,7 @@ impl InstanceTable {
     }
 }
 
-/// Appearance of the instances, by the model of the first that tells; one field has one model.
+/// Appearance of the instances, by the model of the first that has any; one field has one model.
 pub(super) fn embeddings(
     graph: &SceneGraph,
     owners: &[Option<u16>],

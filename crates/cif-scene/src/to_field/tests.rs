@@ -81,8 +81,8 @@ fn a_graph_keeps_its_place_in_the_world() {
     // Edits of a file that lies elsewhere are not taken for edits of this scene.
     let mut edited = graph.clone();
     edited.frame.offset[0] += 1.0;
-    let told = crate::import_edits(&field, &edited, "moved.usda", false).unwrap_err().to_string();
-    assert!(told.contains("moved.usda") && told.contains("export the base again"), "{told}");
+    let message = crate::import_edits(&field, &edited, "moved.usda", false).unwrap_err().to_string();
+    assert!(message.contains("moved.usda") && message.contains("export the base again"), "{message}");
     edited.frame = frame;
     assert!(crate::import_edits(&field, &edited, "same.usda", false).unwrap().1.is_empty());
 }
@@ -330,8 +330,8 @@ fn joints_leave_with_their_parts_and_come_back() {
         });
         let parts = parts.unwrap();
         assert_eq!(parts.parts.len(), 2, "{kind}");
-        let told = parts.parts[1].joint.unwrap();
-        assert_eq!((told.base, told.kind, told.anchor), (0, kind, DVec3::ZERO));
+        let found = parts.parts[1].joint.unwrap();
+        assert_eq!((found.base, found.kind, found.anchor), (0, kind, DVec3::ZERO));
         let [low, high] = parts.joint_range(1).unwrap();
         let most = 0.9 * (TIMES[TIMES.len() - 1] - TIMES[0]);
         assert!(low.abs() < 1e-9 && (high - most).abs() < 1e-9, "{kind}: {low} to {high}, not {most}");
@@ -340,11 +340,11 @@ fn joints_leave_with_their_parts_and_come_back() {
         for key in &parts.parts[1].track {
             let pose = parts.on_base(1, key.time_code).unwrap();
             let moved = pose.translation - first.translation;
-            let across = moved - told.axis * told.axis.dot(moved);
+            let across = moved - found.axis * found.axis.dot(moved);
             let off = if kind == JointKind::Revolute { moved.length() } else { across.length() };
             let turn = (first.rotation.conjugate() * pose.rotation).xyz();
             assert!(off < 1e-9, "{kind}: {off} from the axis");
-            assert!(turn.cross(told.axis).length() < 1e-9, "{kind}: turned by {turn}");
+            assert!(turn.cross(found.axis).length() < 1e-9, "{kind}: turned by {turn}");
         }
         let back = field_from_graph(&graph, "memory").unwrap().tracks.unwrap();
         let group = back.groups.iter().position(|group| group.joint.is_some()).unwrap();

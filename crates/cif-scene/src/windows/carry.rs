@@ -144,6 +144,6 @@ fn without_repetitions(track: Vec<PoseSample>) -> Vec<PoseSample> {
             kept.push(*sample);
         }
     }
-    let rests = kept.iter().all(|sample| same(sample, &kept[0]) && sample.rotation.w.abs() > 1.0 - SAME);
-    if rests { Vec::new() } else { kept }
+    let is_at_rest = kept.iter().all(|sample| same(sample, &kept[0]) && sample.rotation.w.abs() > 1.0 - SAME);
+    if is_at_rest { Vec::new() } else { kept }
 }

@@ -186,7 +186,7 @@ fn report(nodes: &[Option<&Node>]) -> MotionReport {
         report.model = MotionModel::Dense;
     }
     report.parts = 0;
-    let evidence = |wanted| reports().any(|report| report.rotation == Some(wanted));
+    let evidence = |kind| reports().any(|report| report.rotation == Some(kind));
     report.rotation = match (evidence(RotationEvidence::Assumed), evidence(RotationEvidence::Observed)) {
         (true, _) => Some(RotationEvidence::Assumed),
         (false, true) => Some(RotationEvidence::Observed),

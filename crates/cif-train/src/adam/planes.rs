@@ -21,7 +21,7 @@ pub struct PlaneWeights {
 /// Rows that one task sweeps.
 const BAND_ROWS: usize = 16;
 
-/// Rows beside a band that its second differences read.
+/// Rows next to a band that its second differences read.
 const HALO_ROWS: usize = 4;
 
 /// Gradient factors of one plane: of the second difference, and of the distance from 1.

@@ -133,7 +133,7 @@ pub(crate) fn weights(steps: &[(Stage, u32, StepCosts)]) -> Vec<StageShare> {
     steps.iter().map(share).collect()
 }
 
-/// Follows a budget. Knows nothing of training: it is told the time and answers with steps.
+/// Follows a budget. Knows nothing of training: it is given the time and answers with steps.
 #[derive(Clone, Debug)]
 pub struct Pacer {
     budget: Budget,

@@ -97,20 +97,20 @@ heads! {
     /// Gaussians of several labels split or deleted, then codes learnt by contrast.
     // Splitting and deleting, then lifting.
     Trace3d, "trace3d", 9_000 + 20_000;
-    /// Three language channels learnt of given feature maps. It tells no instances apart, and answers questions alone.
+    /// Three language channels learnt of given feature maps. It distinguishes no instances, and answers questions alone.
     // Of the language channels, on Gaussians that move.
     LangSplat, "4d-langsplat", 10_000;
 }
 
 impl HeadName {
-    /// True when it tells labels of pixels; false when it only answers questions.
+    /// True when it labels pixels; false when it only answers questions.
     #[must_use]
     pub fn tells_labels(self) -> bool {
         self != Self::LangSplat
     }
 }
 
-/// Motion that an object is told to have.
+/// Motion that an object is declared to have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ObjectMotion {

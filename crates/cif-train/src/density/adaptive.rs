@@ -135,8 +135,8 @@ fn last_of_objects(rows: &Rows<'_>, goes: &impl Fn(usize) -> bool) -> BTreeSet<u
             of_object.into_iter().partition(|row| goes(*row));
         let opacity = |row: &usize| rows.gaussians.opacity_logits[*row];
         going.sort_by(|a, b| opacity(b).total_cmp(&opacity(a)));
-        let wanted = FEWEST_OF_OBJECT.saturating_sub(staying.len());
-        last.extend(going.into_iter().take(wanted).map(|row| row as u32));
+        let kept = FEWEST_OF_OBJECT.saturating_sub(staying.len());
+        last.extend(going.into_iter().take(kept).map(|row| row as u32));
     }
     last
 }

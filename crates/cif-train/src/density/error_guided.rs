@@ -87,10 +87,10 @@ fn make_room(
     if let Some(Contributions { weight, .. }) = contributions {
         let most = config.max_gaussians as usize;
         let free = most.saturating_sub(n) + goes.iter().filter(|goes| **goes).count();
-        let wanted = (f64::from(config.turnover) * most as f64) as usize;
+        let turnover = (f64::from(config.turnover) * most as f64) as usize;
         let mut shown: Vec<usize> = (0..n).filter(|row| !goes[*row] && weight[*row] > 0.0).collect();
         shown.sort_by(|a, b| weight[*a].total_cmp(&weight[*b]).then(a.cmp(b)));
-        shown.into_iter().take(wanted.saturating_sub(free)).for_each(|row| goes[row] = true);
+        shown.into_iter().take(turnover.saturating_sub(free)).for_each(|row| goes[row] = true);
     }
     remove(rows, config, &|row| goes[row])
 }

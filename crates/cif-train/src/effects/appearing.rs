@@ -11,7 +11,7 @@ use crate::phase::Phase;
 use crate::sightings::Sightings;
 use crate::state::State;
 
-/// Most views that tell whether an object is there while no mask shows it.
+/// Most views that show whether an object is there while no mask shows it.
 const LOOKS: usize = 12;
 
 /// Difference of a channel from which a pixel shows whether an object is there, and fewest such pixels.
@@ -43,21 +43,21 @@ pub(crate) fn hide_absent(
     }
     let mut found = Vec::new();
     let phase = state.phases.enter(Phase::Presence, objects.len());
-    let sightings = sightings(state)?;
+    let observations = observations(state)?;
     for Posed { label, group } in objects {
-        let seen = sightings.of(*label);
+        let seen = observations.of(*label);
         let Some([first, last]) = seen.first().zip(seen.last()).map(|(a, b)| [a, b].map(|o| o.time_index))
         else {
             continue;
         };
         let mut steps = Vec::new();
         let times = &state.dataset.times;
-        if sightings.appears(*label) && is_absent(state, simd, *group, |time| time < first)? {
+        if observations.appears(*label) && is_absent(state, simd, *group, |time| time < first)? {
             let before = last_time_before(state, first);
             let appears = times[(before + first).div_ceil(2)];
             steps.extend([(times[0], false), (appears, true)]);
         }
-        if sightings.vanishes(*label) && is_absent(state, simd, *group, |time| time > last)? {
+        if observations.vanishes(*label) && is_absent(state, simd, *group, |time| time > last)? {
             let after = first_time_after(state, last);
             if steps.is_empty() {
                 steps.push((times[0], true));
@@ -82,19 +82,19 @@ pub(crate) fn hide_absent(
 }
 
 /// Where the masks of training views show objects, by label.
-fn sightings(state: &State) -> Result<Sightings<'_>, TrainError> {
+fn observations(state: &State) -> Result<Sightings<'_>, TrainError> {
     let mut views: Vec<usize> = (0..state.frames.len()).collect();
     views.sort_by_key(|view| state.dataset.frames[state.frames.index(*view)].time_index);
-    let mut sightings = Sightings::default();
+    let mut observations = Sightings::default();
     let masks = state.frames.masks(&state.dataset, &state.phases)?;
     for view in views {
         let frame = &state.dataset.frames[state.frames.index(view)];
         if let Some(table) = &masks[view] {
             let seen = table.observations(&frame.camera, frame.time_index);
-            sightings.add(&frame.camera_name, frame.time_index, seen);
+            observations.add(&frame.camera_name, frame.time_index, seen);
         }
     }
-    Ok(sightings)
+    Ok(observations)
 }
 
 /// The last time of training views before one, and the first after one.

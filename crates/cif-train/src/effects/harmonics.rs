@@ -42,8 +42,8 @@ impl Effect for Harmonics {
 
     fn judge(&self, bench: &mut Bench<'_>) -> Result<(), TrainError> {
         if bench.moment().has(Due::TakeBackHarmonics) {
-            let wanted = f64::from(bench.config().effects.sh_gain);
-            while bench.state.field.sh_degree > 0 && !degree_gains(bench, wanted)? {
+            let required = f64::from(bench.config().effects.sh_gain);
+            while bench.state.field.sh_degree > 0 && !degree_gains(bench, required)? {
                 take_back_degree(bench);
             }
         } else if degree_gains(bench, 0.0)? {
@@ -54,14 +54,14 @@ impl Effect for Harmonics {
 }
 
 /// True when the highest degree of spherical harmonics gains as much on the held-out pixels, dB.
-fn degree_gains(bench: &mut Bench<'_>, wanted: f64) -> Result<bool, TrainError> {
+fn degree_gains(bench: &mut Bench<'_>, required: f64) -> Result<bool, TrainError> {
     let degree = bench.state.field.sh_degree;
     let settings = bench.state.color_settings();
     let lower = RenderSettings { sh_degree: degree - 1, ..settings };
     let with = bench.error_with(None, &settings)?;
     let without = bench.error_with(None, &lower)?;
     let gain_db = gain(without, with);
-    let kept = gain_db >= wanted;
+    let kept = gain_db >= required;
     bench.report(format!("view-dependent colour of degree {degree}"), gain_db, kept);
     Ok(kept)
 }

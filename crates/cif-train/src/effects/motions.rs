@@ -16,7 +16,7 @@ const CHUNK: usize = 4_096;
 /// Side of the cells in which Gaussians have neighbours, relative to the extent.
 const AROUND: f32 = 0.02;
 
-/// Cells from the origin up to which neighbouring cells are told apart: whole numbers beyond are not all exact in
+/// Cells from the origin up to which neighbouring cells are distinguished: whole numbers beyond are not all exact in
 /// double precision. What lies farther away is put into the last cell.
 const FARTHEST_CELL: f64 = 9.0e15;
 
@@ -65,7 +65,7 @@ impl Limits {
 /// reaches.
 const SHADOW: f64 = 2.0;
 
-/// Most Gaussians of an object that tell where it passes.
+/// Most Gaussians of an object that show where it passes.
 const PASSING: usize = 64;
 
 /// Gaussians among others that move: of those that go through the network around them, a share moves more than the
@@ -132,22 +132,22 @@ fn passed(field: &Field, limits: Limits) -> impl Iterator<Item = DVec3> {
 
 /// Takes rows out of the network, at the mean of what it did to them; returns their number. A field without a
 /// deformation stays as it is.
-pub(crate) fn put_to_rest(field: &mut Field, motions: &[Motion], wanted: impl Fn(usize) -> bool) -> usize {
-    set_still(field, motions, true, wanted)
+pub(crate) fn put_to_rest(field: &mut Field, motions: &[Motion], selected: impl Fn(usize) -> bool) -> usize {
+    set_still(field, motions, true, selected)
 }
 
 /// Hands rows back to the network, near where they were; returns their number.
-pub(crate) fn wake(field: &mut Field, motions: &[Motion], wanted: impl Fn(usize) -> bool) -> usize {
-    set_still(field, motions, false, wanted)
+pub(crate) fn wake(field: &mut Field, motions: &[Motion], selected: impl Fn(usize) -> bool) -> usize {
+    set_still(field, motions, false, selected)
 }
 
-fn set_still(field: &mut Field, motions: &[Motion], to: bool, wanted: impl Fn(usize) -> bool) -> usize {
+fn set_still(field: &mut Field, motions: &[Motion], to: bool, selected: impl Fn(usize) -> bool) -> usize {
     let Some(deformation) = &mut field.deformation else { return 0 };
     deformation.still.resize(motions.len(), false);
     let mut changed = 0;
     for (row, motion) in motions.iter().enumerate() {
         let is_grouped = field.tracks.as_ref().is_some_and(|tracks| tracks.group(row).is_some());
-        if deformation.still[row] != to && wanted(row) && !is_grouped {
+        if deformation.still[row] != to && selected(row) && !is_grouped {
             motion.mean.add_to(&mut field.gaussians, row, if to { 1.0 } else { -1.0 });
             deformation.still[row] = to;
             changed += 1;
@@ -344,12 +344,12 @@ mod tests {
         let limits = Limits { displacement: 0.01, shape: 1.0 };
         let first_crowd: Vec<bool> = (0..60).map(|row| row < 30).collect();
         assert_eq!(restless(&field, &motions, limits), first_crowd);
-        // Only those that are looked at count: where few of many are awake, these tell for all.
+        // Only those that are looked at count: where few of many are awake, these represent all.
         field.deformation.as_mut().unwrap().still = (0..60).map(|row| row % 3 != 0).collect();
         assert_eq!(restless(&field, &motions, limits), first_crowd);
         field.deformation.as_mut().unwrap().still = (0..60).map(|row| row % 3 == 0).collect();
         assert_eq!(restless(&field, &motions, limits), [false; 60]);
-        // Two are too few to tell.
+        // Two are too few to judge.
         field.deformation.as_mut().unwrap().still.clear();
         motions.iter_mut().skip(4).for_each(|motion| motion.displacement = 0.0);
         assert_eq!(restless(&field, &motions, limits), [false; 60]);

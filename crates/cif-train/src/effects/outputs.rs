@@ -15,7 +15,7 @@ use crate::schedule::{Due, Moment};
 /// Outputs that may go, the least needed first.
 const OPTIONAL: [HeadKind; 4] = [HeadKind::Sh, HeadKind::Opacity, HeadKind::Scale, HeadKind::Rotation];
 
-/// Outputs beside the centres.
+/// Outputs other than the centres.
 pub(crate) struct Outputs;
 
 impl Effect for Outputs {
@@ -28,14 +28,14 @@ impl Effect for Outputs {
     }
 
     fn judge(&self, bench: &mut Bench<'_>) -> Result<(), TrainError> {
-        let wanted = f64::from(bench.config().effects.head_gain);
+        let required = f64::from(bench.config().effects.head_gain);
         let times = probe_times(&bench.state.dataset.times);
         for kind in OPTIONAL {
             let Some(trial) = without_output(bench.field(), kind, &times) else { continue };
             let with = bench.error(None)?;
             let without = bench.error(Some(&trial.field))?;
             let gain_db = gain(without, with);
-            let kept = gain_db >= wanted;
+            let kept = gain_db >= required;
             if !kept {
                 remove_output(bench, trial);
             }

@@ -17,8 +17,9 @@ const OWN_LOSS: f64 = 1.0;
 const LOSS: f64 = 0.05;
 
 /// Displacement of the Gaussians of an instance, root mean square, of their spread, up to which it trembles, as where the
-/// network draws reflections by shifting them, and the losses, dB, up to which it rests all the same, as its colours are
-/// still trained: on its own pixels, and together on all, which shadows on large things are worth more.
+/// network draws reflections by shifting them, and the losses, dB, up to which it is put to rest
+/// anyway, as its colours are still trained: on its own pixels, and together on all, which shadows on large things are
+/// worth more.
 const TREMBLES: f64 = 0.06;
 const TREMBLING_LOSSES: [f64; 2] = [8.0, 0.3];
 
@@ -38,10 +39,10 @@ pub(crate) fn rest_instances(bench: &mut Bench<'_>, motions: &[Motion]) -> Resul
     let before = bench.errors(None, &settings)?;
     while resting.contains(&true) {
         let mut trial = bench.state.field.clone();
-        let rests = |row: usize| {
+        let at_rest = |row: usize| {
             instance_of[row].is_some_and(|instance| resting[instance]) && !is_mover(bench.state, row)
         };
-        let count = put_to_rest(&mut trial, motions, rests);
+        let count = put_to_rest(&mut trial, motions, at_rest);
         let after = bench.errors(Some(&trial), &settings)?;
         let missed = missed(&before, &after, &resting, &trembling);
         if missed.is_empty() {
@@ -53,7 +54,7 @@ pub(crate) fn rest_instances(bench: &mut Bench<'_>, motions: &[Motion]) -> Resul
     Ok(0)
 }
 
-/// True for instances that the network shifts little beside their size.
+/// True for instances that the network shifts little compared with their size.
 fn trembling(state: &State, motions: &[Motion], instance_of: &[Option<usize>]) -> Vec<bool> {
     let field = &state.field;
     let is_still = |row: usize| field.deformation.as_ref().is_none_or(|network| network.is_still(row));
@@ -86,7 +87,7 @@ fn is_mover(state: &State, row: usize) -> bool {
     is_posed || state.guidance.travels(row)
 }
 
-/// Instances of which something goes through the network that is no mover, and that are not told to be free.
+/// Instances of which something goes through the network that is no mover, and that are not declared free.
 fn may_rest(state: &State, instance_of: &[Option<usize>]) -> Vec<bool> {
     let field = &state.field;
     let mut may_rest = vec![false; field.instances.len()];
@@ -118,7 +119,7 @@ impl Shift {
         self.squared_displacements += weight * displacement * displacement;
     }
 
-    /// True of displacements that are small beside the spread of the places.
+    /// True of displacements that are small compared with the spread of the places.
     fn trembles(&self) -> bool {
         let spread = self.squared_places / self.weight - (self.places / self.weight).length_squared();
         self.squared_displacements / self.weight <= TREMBLES * TREMBLES * spread
@@ -185,8 +186,8 @@ mod tests {
         let after = bench.error(None).unwrap();
         for (row, instance) in instance_of.iter().enumerate() {
             let is_still = trainer.state.field.deformation.as_ref().unwrap().is_still(row);
-            let rests = *instance == Some(0) && !is_mover(&trainer.state, row);
-            assert!(is_still || !rests, "{row} of a ball that rests");
+            let at_rest = *instance == Some(0) && !is_mover(&trainer.state, row);
+            assert!(is_still || !at_rest, "{row} of a ball that rests");
             assert!(!is_still || !is_mover(&trainer.state, row), "{row} of the ball that moves");
         }
         assert!(!may_rest(&trainer.state, &instance_of)[0]);

@@ -5,8 +5,8 @@
 //! parameters once, and the network then leaves it alone, forward and backward. What has not learnt to move yet
 //! looks like what never will: so nothing settles among others that move, and a changing few of those that stand
 //! still go through the network all the same. Where these learn to move, their neighbours are handed back. Where all
-//! cameras stay in place, their images tell from the start: what they see change stays in the network for half of the
-//! fine stage, and the rest leaves it at once. Where masks tell which objects travel, the same holds for these from
+//! cameras stay in place, their images show it from the start: what they see change stays in the network for half of the
+//! fine stage, and the rest leaves it at once. Where masks show which objects travel, the same holds for these from
 //! an early step of a long stage on, provided that it hardly shows; what else moves is then handed back.
 
 use cif_field::Field;
@@ -29,9 +29,9 @@ use crate::stage::Stage;
 /// and forth.
 const RELEASE: f32 = 2.0;
 
-/// Where masks tell the travelling objects: loss, dB on held-out pixels, up to which everything else is taken to
+/// Where masks show the travelling objects: loss, dB on held-out pixels, up to which everything else is taken to
 /// stand still on the first test.
-const TOLD_LOSS: f64 = 0.1;
+const MASKS_LOSS: f64 = 0.1;
 
 /// Rungs of the ladder of limits, each half of the one above.
 const RUNGS: u32 = 3;
@@ -57,7 +57,7 @@ impl Effect for Still {
         let mut settled = None;
         if bench.moment().has(Due::StillByMasks) {
             let stands = |row: usize| !evidence.watched[row] && !evidence.travels[row];
-            settled = try_to_settle(bench, &evidence.motions, stands, &mut error, TOLD_LOSS)?;
+            settled = try_to_settle(bench, &evidence.motions, stands, &mut error, MASKS_LOSS)?;
         }
         let mut released = 0;
         if settled.is_none() {
@@ -106,7 +106,7 @@ impl Evidence {
         let sights = sights(bench, &motions)?;
         let mut watched = draw_watched(bench);
         for (row, _) in sights.iter().enumerate().filter(|(_, sight)| **sight == Sight::Steady) {
-            // Nothing tells this motion from none.
+            // Nothing distinguishes this motion from none.
             (motions[row].displacement, motions[row].shape) = (0.0, 0.0);
             watched[row] = false;
         }
@@ -139,8 +139,8 @@ fn climb_down(
     let mut settled = None;
     while settled.is_none() && rung < RUNGS {
         let limits = evidence.highest.scaled(0.5_f32.powi(rung as i32));
-        let rests = |row: usize| !evidence.awake[row] && limits.hold(&evidence.motions[row]);
-        settled = try_to_settle(bench, &evidence.motions, rests, error, allowed)?;
+        let at_rest = |row: usize| !evidence.awake[row] && limits.hold(&evidence.motions[row]);
+        settled = try_to_settle(bench, &evidence.motions, at_rest, error, allowed)?;
         rung += u32::from(settled.is_none());
     }
     bench.state.progress.still_rung = rung.min(RUNGS - 1);
@@ -169,12 +169,12 @@ fn hand_back(bench: &mut Bench<'_>, evidence: &Evidence, error: f64) -> Result<u
 fn try_to_settle(
     bench: &mut Bench<'_>,
     motions: &[Motion],
-    wanted: impl Fn(usize) -> bool,
+    selected: impl Fn(usize) -> bool,
     error: &mut f64,
     allowed: f64,
 ) -> Result<Option<usize>, TrainError> {
     let mut trial = bench.state.field.clone();
-    let found = put_to_rest(&mut trial, motions, wanted);
+    let found = put_to_rest(&mut trial, motions, selected);
     if found > 0 {
         let after = bench.error(Some(&trial))?;
         if gain(after, *error) > allowed {
@@ -244,7 +244,7 @@ mod tests {
     fn nothing_is_handed_back_where_the_network_learnt_nothing() {
         let folder = tempfile::tempdir().unwrap();
         let mut dataset = capture(folder.path(), Scene { views: 2, ..Scene::default() });
-        // So that its images do not tell what changes.
+        // So that its images do not show what changes.
         let frame = dataset.frames.iter_mut().find(|frame| frame.split == Split::Train).unwrap();
         frame.camera.camera_from_world.translation.x += 1e-3;
         let mut config = small_config();

@@ -104,7 +104,7 @@ pub(crate) trait Engine: Any + Send {
     /// Moments of the Gaussians follow relocations.
     fn relocate(&mut self, state: &mut State, pairs: &[Pair], relocated: &Relocated);
 
-    /// Takes the changes since [`Self::begin_changes`]; `resets_opacities` tells whether opacities were reset among
+    /// Takes the changes since [`Self::begin_changes`]; `resets_opacities` says whether opacities were reset among
     /// them. `None` when they failed.
     ///
     /// # Errors

@@ -1,4 +1,4 @@
-//! How bright images record points: beside their known colours, and beside one another.
+//! How bright images record points: relative to their known colours, and to one another.
 
 use cif_dataset::{Dataset, PointSource};
 use cif_geometry::stats::{median, upper_median};
@@ -60,14 +60,14 @@ impl<'a> Recorded<'a> {
 
     /// Logarithms of how much brighter than their colours all images record the points, by channel: the median, for half of
     /// these may be hidden, shiny or misplaced. `None` of too few.
-    pub(crate) fn beside_colors(&self) -> Option<[f64; 3]> {
+    pub(crate) fn relative_to_colors(&self) -> Option<[f64; 3]> {
         let of = |channel: usize| {
             let points = || self.points.iter().map(|(_, color)| brightness(color[channel]));
-            let beside = |image: &Vec<[f64; 3]>| {
+            let differences = |image: &Vec<[f64; 3]>| {
                 image.iter().zip(points()).map(|(seen, known)| seen[channel] - known).collect::<Vec<_>>()
             };
             let mut ratios: Vec<f64> =
-                self.images.iter().flat_map(beside).filter(|ratio| ratio.is_finite()).collect();
+                self.images.iter().flat_map(differences).filter(|ratio| ratio.is_finite()).collect();
             upper_median(&mut ratios).filter(|_| ratios.len() >= SAMPLES)
         };
         Some([of(0)?, of(1)?, of(2)?])

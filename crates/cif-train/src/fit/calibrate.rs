@@ -13,7 +13,7 @@ use crate::step::InstancePass;
 use crate::times::StepShares;
 use crate::trainer::Trainer;
 
-/// Training frames that steps are measured on; decoding more would cost more than it tells.
+/// Training frames that steps are measured on; decoding more would cost more than it gains.
 const FRAMES: usize = 8;
 
 /// Steps before measuring, and the most that are measured.

@@ -126,7 +126,7 @@ fn set_schedule(config: &mut TrainConfig, base: &TrainConfig, factor: f64, of_in
     config.stages.fine_includes_coarse = false;
     config.stages.instance = times(base.stages.instance, of_instances, 1);
     config.rates.schedule_steps = scaled(base.rates.schedule_steps, 1);
-    // Growing later than usual only makes a long run longer.
+    // Growing later than by default only makes a long run longer.
     let shortened = |steps: u32, least: u32| times(steps, factor.min(1.0), least);
     let of_stage = |steps: u32, least: u32| times(steps, of_instances.min(1.0), least);
     config.model.sh_interval = shortened(base.model.sh_interval, 20);

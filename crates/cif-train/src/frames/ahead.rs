@@ -29,19 +29,19 @@ impl Ahead {
 
     /// Begins the first [`MOST`] of some frames that are not begun, and gives up all that are not among them.
     pub(crate) fn expect(&self, coming: impl Iterator<Item = usize>, decoding: &Arc<Decoding>) {
-        let mut wanted: Vec<usize> = Vec::new();
+        let mut needed: Vec<usize> = Vec::new();
         for index in coming {
-            if wanted.len() == MOST {
+            if needed.len() == MOST {
                 break;
             }
-            if !wanted.contains(&index) {
-                wanted.push(index);
+            if !needed.contains(&index) {
+                needed.push(index);
             }
         }
         let mut begun = self.lock();
         // A thread that runs ends by itself; its frame is dropped.
-        begun.retain(|index, _| wanted.contains(index));
-        for index in wanted {
+        begun.retain(|index, _| needed.contains(index));
+        for index in needed {
             begun.entry(index).or_insert_with(|| {
                 let (dataset, decoding) = (Arc::clone(&self.dataset), Arc::clone(decoding));
                 std::thread::spawn(move || decoding.load(&dataset, index))

@@ -1,4 +1,4 @@
-//! The head of a finished scene, which tells labels of pixels where its identity rows would tell others.
+//! The head of a finished scene, which labels pixels where its identity rows would label them otherwise.
 
 use std::sync::Arc;
 
@@ -23,7 +23,7 @@ struct Saved {
     head: HeadConfig,
 }
 
-/// A trained head beside its scene.
+/// A trained head with its scene.
 #[derive(Clone)]
 pub struct Decoder {
     head: Arc<dyn Head>,
@@ -64,7 +64,7 @@ impl Decoder {
         self.head.name()
     }
 
-    /// True when it tells labels of pixels; false when it only answers questions.
+    /// True when it labels pixels; false when it only answers questions.
     #[must_use]
     pub fn tells_labels(&self) -> bool {
         self.values().target() == Target::Labels

@@ -29,7 +29,7 @@ pub trait Head: Send + Sync {
     /// Name in saved runs and messages.
     fn name(&self) -> &'static str;
 
-    /// Its way from the Gaussians to the labels of pixels.
+    /// Its path from the Gaussians to the labels of pixels.
     fn pass(&self, config: &TrainConfig) -> Pass<'_>;
 }
 
@@ -45,10 +45,10 @@ pub struct HeadLoss {
 /// What the blended values of a head are held to.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Target {
-    /// Labels of masks, which it tells back.
+    /// Labels of masks, which it reproduces.
     #[default]
     Labels,
-    /// Feature maps that were given ([`HeadConfig::maps`]); it tells no labels.
+    /// Feature maps that were given ([`HeadConfig::maps`]); it decodes no labels.
     Features,
 }
 
@@ -100,9 +100,9 @@ pub struct OwnOpacity {
 /// Cameras between two training views of one time, supervised with the labels of both.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CameraBlending {
-    /// Weight of their loss beside that of a view, times the similarity (SSIM) of the two images.
+    /// Weight of their loss relative to that of a view, times the similarity (SSIM) of the two images.
     pub weight: f32,
-    /// Limits of the place of such a camera on the way from the first view to the second, in [0, 1].
+    /// Limits of the place of such a camera on the path from the first view to the second, in [0, 1].
     pub ratio: [f32; 2],
 }
 
@@ -114,7 +114,7 @@ pub(super) type Layers = Vec<Vec<f32>>;
 pub struct HeadValues {
     /// `[N, C]`; 0 in rows that were not asked for, where a head leaves them out.
     pub values: Vec<f32>,
-    /// Rows that a network evaluated, and its layers there, for the way back.
+    /// Rows that a network evaluated, and its layers there, for the backward pass.
     pub(super) layers: (Vec<u32>, Vec<Layers>),
 }
 
@@ -189,7 +189,7 @@ pub trait ValueHead: Send + Sync {
         tensors.values(&self.codes()).to_vec()
     }
 
-    /// The values of some rows, ascending, at a time, and what the way back needs of them. Heads whose values cost
+    /// The values of some rows, ascending, at a time, and what the backward pass needs of them. Heads whose values cost
     /// nothing give those of all rows.
     fn values_of(&self, tensors: &HeadTensors, field: &Field, time: f64, _rows: &[u32]) -> HeadValues {
         self.values(tensors, field, time).into()

@@ -1,4 +1,4 @@
-//! Heads: what the instance stage learns about instances, and how pixels tell it back.
+//! Heads: what the instance stage learns about instances, and how pixels decode to labels.
 //!
 //! | file | holds |
 //! |---|---|
@@ -6,14 +6,14 @@
 //! | `registry` | heads by name |
 //! | `cif` | the head of the paper |
 //! | `dr_splat`, `gaussian_grouping`, `sa4d`, `vlgs`, `trace3d` | those of the systems that it is compared with |
-//! | `lang_splat` | that of a system which tells no instances apart, but answers questions |
-//! | `classifier` | codes told apart by a linear classifier, and neighbours that agree: what several of these share |
+//! | `lang_splat` | that of a system which distinguishes no instances, but answers questions |
+//! | `classifier` | codes distinguished by a linear classifier, and neighbours that agree: what several of these share |
 //! | `tensors` | what heads learn, with gradients and moments |
 //! | `views` | the training views as heads may look at them between steps |
 //! | `labels` | blended values of a view, and labels of pixels and Gaussians |
 //! | `decoder` | the head of a finished scene |
 //!
-//! A head of another system declares tensors of its own ([`Parameter`]s, beside the table of the field), the C values
+//! A head of another system declares tensors of its own ([`Parameter`]s that the table of the field lacks), the C values
 //! that they give every Gaussian, a loss on these values blended over a view, and how a blended pixel decodes to a
 //! label. Its tensors follow the Gaussians when these are cloned, split, pruned or relocated, are saved with the run
 //! and with the scene, and are stepped by the same optimiser, whichever engine blends. Gaussians and deformation stay

@@ -34,19 +34,19 @@ impl<'a> TrainingViews<'a> {
         self.settings
     }
 
-    /// Calls `each` with every training view that has a mask and whose camera `wanted` takes.
+    /// Calls `each` with every training view that has a mask and whose camera is `chosen`.
     ///
     /// # Errors
     /// When a frame cannot be read, or the run is to stop.
     pub fn each_masked(
         &mut self,
-        wanted: &dyn Fn(&str) -> bool,
+        chosen: &dyn Fn(&str) -> bool,
         each: &mut dyn FnMut(&mut Renderer, &Frame, &PixelGrid<u16>),
     ) -> Result<(), TrainError> {
         for view in 0..self.frames.len() {
             self.phases.check()?;
             let frame = &self.dataset.frames[self.frames.index(view)];
-            if !wanted(&frame.camera_name) {
+            if !chosen(&frame.camera_name) {
                 continue;
             }
             let data = self.frames.get(self.dataset, view)?;

@@ -41,7 +41,7 @@ pub struct SsimScratch {
     maps: [Vec<Vector>; 3],
 }
 
-/// A view beside its target, `[height, width, 3]` each.
+/// A view with its target, `[height, width, 3]` each.
 #[derive(Clone, Copy)]
 struct Compared<'a> {
     /// Colours of the view, in [0, 1] where they are in range.

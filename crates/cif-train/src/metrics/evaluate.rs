@@ -26,7 +26,7 @@ use super::panoptic::{PanopticMetrics, panoptic_metrics, with_background};
 pub struct EvaluationOptions<'a> {
     /// Frames to score.
     pub split: Split,
-    /// Render settings; usually [`trained_settings`].
+    /// Render settings; typically [`trained_settings`].
     pub settings: RenderSettings,
     /// Vector instructions.
     pub simd: SimdLevel,
@@ -34,7 +34,7 @@ pub struct EvaluationOptions<'a> {
     pub depth: bool,
     /// Also score over the pixels that training views show, see [`super::covisible`]; renders them first.
     pub covisible: bool,
-    /// Head that tells the labels of pixels; `None` where the identity rows do.
+    /// Head that labels pixels; `None` where the identity rows do.
     pub decoder: Option<&'a Decoder>,
 }
 

@@ -1,4 +1,4 @@
-//! Check that a capture is the one that a scene was trained on, as far as the scene's record tells.
+//! Check that a capture is the one that a scene was trained on, as far as the scene's record shows.
 //!
 //! Compared is what decides where and when a view shows the scene: poses and times. Image sizes, splits and lenses
 //! may differ, and frames, cameras and masks may be missing or new. A scene without recorded cameras fits every
@@ -95,7 +95,7 @@ impl<'a> Recorded<'a> {
     }
 }
 
-/// A view of the capture beside the record.
+/// A view of the capture compared with the record.
 struct View {
     /// Distance of the nearest recorded camera, scene extents, where none has the pose of the view.
     distance_if_unknown: Option<f64>,
@@ -155,27 +155,27 @@ fn other_times(field: &Field, dataset: &Dataset, views: &[View]) -> Option<Misfi
 
 /// Instances of the masks that are unknown to the scene, or called otherwise there.
 fn other_instances(field: &Field, dataset: &Dataset, is_other_place: bool) -> Option<Misfit> {
-    let mut told: Vec<String> = Vec::new();
+    let mut others: Vec<String> = Vec::new();
     for InstanceLabel { id, label, .. } in &dataset.instances {
         match field.instance_by_id(*id).map(|index| &field.instances[index].label) {
-            None => told.push(format!("{id} ({label}) is unknown to the scene")),
+            None => others.push(format!("{id} ({label}) is unknown to the scene")),
             // Where nobody named an instance, its id is all there is to compare.
             Some(known) if known == label || [known, label].iter().any(|name| is_placeholder(name, *id)) => {}
-            Some(known) => told.push(format!("{id} is {label} in the masks and {known} in the scene")),
+            Some(known) => others.push(format!("{id} is {label} in the masks and {known} in the scene")),
         }
     }
-    if told.is_empty() {
+    if others.is_empty() {
         return None;
     }
-    let (count, all) = (told.len(), dataset.instances.len());
+    let (count, all) = (others.len(), dataset.instances.len());
     let more = if count > MOST_NAMED { ", ..." } else { "" };
-    told.truncate(MOST_NAMED);
+    others.truncate(MOST_NAMED);
     Some(Misfit {
         severity: if is_other_place { Severity::Warning } else { Severity::Note },
         message: format!(
             "{}: {count} of {all} instances of the masks are others in the scene: {}{more}; instance scores compare ids",
             dataset.root.display(),
-            told.join(", ")
+            others.join(", ")
         ),
     })
 }
@@ -285,7 +285,7 @@ mod tests {
         field
     }
 
-    fn told(dataset: &Dataset) -> Vec<(Severity, String)> {
+    fn reported(dataset: &Dataset) -> Vec<(Severity, String)> {
         let found = misfits(&field(), dataset, Split::Val);
         found.into_iter().map(|misfit| (misfit.severity, misfit.message)).collect()
     }
@@ -293,40 +293,40 @@ mod tests {
     #[test]
     fn the_capture_of_the_scene_fits_in_all_its_variants() {
         let whole = dataset();
-        assert_eq!(told(&whole), []);
+        assert_eq!(reported(&whole), []);
         // Another resolution, other splits.
         let mut other = whole.clone();
         for frame in &mut other.frames {
             frame.camera = frame.camera.resized(640, 480);
             frame.split = Split::Val;
         }
-        assert_eq!(told(&other), []);
+        assert_eq!(reported(&other), []);
         // Some of the frames, at the times of the whole.
         let mut some = whole.clone();
         some.frames.retain(|frame| frame.time_index % 4 == 0 || frame.time_index == 1);
-        assert_eq!(told(&some), []);
+        assert_eq!(reported(&some), []);
         // Poses that were written with few digits.
         let mut rounded = whole.clone();
         for frame in &mut rounded.frames {
             let pose = &mut frame.camera.camera_from_world;
             pose.translation = (pose.translation * 1e4).round() / 1e4;
         }
-        assert_eq!(told(&rounded), []);
+        assert_eq!(reported(&rounded), []);
         // Neither masks, nor instances.
         let unlabelled = Dataset { instances: Vec::new(), ..whole.clone() };
-        assert_eq!(told(&unlabelled), []);
+        assert_eq!(reported(&unlabelled), []);
         // Ids without names are compared as ids.
         let mut named = whole;
         named.instances[2].label = "spoon".into();
         named.instances[0].label = "instance_1".into();
-        assert_eq!(told(&named), []);
+        assert_eq!(reported(&named), []);
         // A scene that records no cameras.
         let imported = Field { cameras: Vec::new(), ..field() };
         assert_eq!(misfits(&imported, &dataset(), Split::Val), []);
     }
 
     #[test]
-    fn another_capture_is_told_by_its_cameras() {
+    fn another_capture_is_recognised_by_its_cameras() {
         // Half a unit to the right; cameras of the arc stand 0.3 apart.
         let mut other = dataset();
         for frame in &mut other.frames {
@@ -338,7 +338,7 @@ mod tests {
             category: "dog".into(),
             taxonomies: Default::default(),
         }];
-        let found = told(&other);
+        let found = reported(&other);
         assert_eq!(found.len(), 2, "{found:?}");
         assert_eq!((found[0].0, found[1].0), (Severity::Warning, Severity::Warning));
         for word in ["3 of 3 views", "none of the 9", "`table`", "0.26 scene extents"] {
@@ -355,7 +355,7 @@ mod tests {
                 translation: -(half * pose.rotation * centre),
             };
         }
-        let found = told(&turned);
+        let found = reported(&turned);
         assert_eq!(found.len(), 1, "{found:?}");
         assert!(found[0].1.contains("3 of 3 views"), "{found:?}");
     }
@@ -364,7 +364,7 @@ mod tests {
     fn a_few_new_views_are_a_note() {
         let mut more = dataset();
         more.frames[1].camera = camera(0.12, 0.0);
-        let found = told(&more);
+        let found = reported(&more);
         assert_eq!(found.len(), 1, "{found:?}");
         assert_eq!(found[0].0, Severity::Note);
         assert!(found[0].1.contains("1 of 3 views are new"), "{found:?}");
@@ -377,7 +377,7 @@ mod tests {
         for frame in &mut part.frames {
             frame.time *= 2.0;
         }
-        let found = told(&part);
+        let found = reported(&part);
         assert_eq!(found.len(), 1, "{found:?}");
         assert_eq!(found[0].0, Severity::Warning);
         assert!(found[0].1.contains("2 of 2 views") && found[0].1.contains("up to 0.500"), "{found:?}");
@@ -387,7 +387,7 @@ mod tests {
         // Times between recorded ones are no misfit.
         let mut between = dataset();
         between.frames[1].time += 0.4 / (TIMES - 1) as f64;
-        assert_eq!(told(&between), []);
+        assert_eq!(reported(&between), []);
     }
 
     #[test]
@@ -396,7 +396,7 @@ mod tests {
         for label in &mut other.instances {
             label.id += 100;
         }
-        let found = told(&other);
+        let found = reported(&other);
         assert_eq!(found.len(), 1, "{found:?}");
         assert_eq!(found[0].0, Severity::Note);
         assert!(found[0].1.contains("3 of 3 instances") && found[0].1.contains("101"), "{found:?}");

@@ -187,7 +187,7 @@ fn shown_ids(field: &Field, image: &RenderedImage) -> PixelGrid<u16> {
 struct ObjectErrors(BTreeMap<u16, (f64, u64)>);
 
 impl ObjectErrors {
-    /// Adds a picture, clamped to [0, 1] as in [`psnr`]; `ids` tells which object shows where.
+    /// Adds a picture, clamped to [0, 1] as in [`psnr`]; `ids` says which object shows where.
     fn add(&mut self, ids: &PixelGrid<u16>, rendered: &PixelGrid<[f32; 3]>, truth: &PixelGrid<[f32; 3]>) {
         for ((id, a), b) in ids.pixels.iter().zip(&rendered.pixels).zip(&truth.pixels) {
             let (squares, values) = self.0.entry(*id).or_default();
@@ -261,13 +261,13 @@ mod tests {
         let SyntheticScene { field, camera, .. } = scene();
         let same = compare(&field, &field.clone(), &camera);
         assert_eq!((same.views, same.psnr, same.miou), (2, None, Some(100.0)));
-        let told: Vec<(u16, bool)> =
+        let reported: Vec<(u16, bool)> =
             same.objects.iter().map(|object| (object.id, object.psnr.is_none())).collect();
-        assert!(told.contains(&(3, true)) && told.contains(&(8, true)), "{told:?}");
+        assert!(reported.contains(&(3, true)) && reported.contains(&(8, true)), "{reported:?}");
     }
 
     #[test]
-    fn the_object_that_changed_is_told() {
+    fn the_object_that_changed_is_found() {
         let SyntheticScene { field, camera, .. } = scene();
         let owners = field.identities.as_ref().unwrap().argmax();
         let rows = || (0..field.len()).filter(|row| owners[*row] == Some(1));
@@ -276,20 +276,20 @@ mod tests {
         for row in rows() {
             copy.gaussians.sh_coefficients[row][0] += 0.7;
         }
-        let told = compare(&field, &copy, &camera);
-        let of = |id: u16| told.objects.iter().find(|object| object.id == id).unwrap();
+        let reported = compare(&field, &copy, &camera);
+        let of = |id: u16| reported.objects.iter().find(|object| object.id == id).unwrap();
         let [left, right] = [3, 8].map(|id| of(id).psnr.unwrap_or(f64::INFINITY));
-        assert!(right < 25.0 && left > right + 5.0, "{told:#?}");
-        assert_eq!((told.miou, of(8).iou), (Some(100.0), Some(100.0)), "shapes are as they were");
+        assert!(right < 25.0 && left > right + 5.0, "{reported:#?}");
+        assert_eq!((reported.miou, of(8).iou), (Some(100.0), Some(100.0)), "shapes are as they were");
 
         // Without the object its pixels belong to nobody.
         for row in rows() {
             copy.gaussians.opacity_logits[row] = -9.0;
             copy.gaussians.occupancy_logits[row] = -9.0;
         }
-        let told = compare(&field, &copy, &camera);
-        let iou = |id: u16| told.objects.iter().find(|object| object.id == id).unwrap().iou.unwrap();
-        assert!(iou(8) < 30.0 && iou(3) > 60.0, "{told:#?}");
+        let reported = compare(&field, &copy, &camera);
+        let iou = |id: u16| reported.objects.iter().find(|object| object.id == id).unwrap().iou.unwrap();
+        assert!(iou(8) < 30.0 && iou(3) > 60.0, "{reported:#?}");
     }
 
     #[test]

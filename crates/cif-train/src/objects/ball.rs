@@ -27,8 +27,8 @@ const KEPT: usize = 32;
 /// Cost in agreement, per radian of change from time to time, of such turns.
 const FAST_COST: f64 = 0.15;
 
-/// Agreement of the times from which such turns are told: among so many some agree by chance.
-const TOLD_OF_ANY: f64 = 0.45;
+/// Agreement of the times from which such turns are accepted: among so many some agree by chance.
+const LEAST_AGREEMENT_OF_ANY: f64 = 0.45;
 
 /// Times in a row that are taken to turn evenly, and how many of them lie between beginnings that are tried.
 const WINDOW: usize = 6;
@@ -58,10 +58,10 @@ const REFINED: [f64; 2] = [0.16, 0.01];
 /// Cost in agreement of the largest change of the turn, away from the middle of the neighbours.
 const UNEVEN_COST: f64 = 0.1;
 
-/// Agreement of the times from which the texture tells the turns, how many times that of no turn it must be, and share
+/// Agreement of the times from which the texture determines the turns, how many times that of no turn it must be, and share
 /// of it that rolling may have.
-const TOLD: f64 = 0.3;
-const RESTS: f64 = 1.3;
+const LEAST_AGREEMENT: f64 = 0.3;
+const ABOVE_REST: f64 = 1.3;
 const ROLLS: f64 = 0.3;
 
 /// Cameras of a time from which most of the ball is seen.
@@ -80,7 +80,7 @@ const HIDDEN: f64 = 0.3;
 const WELL: f64 = 0.7;
 
 /// Rotations of a ball by time, relative to some frame of it, that explain how its texture moves; `None` where it does not
-/// tell them, or tells that it rolls: `rolls` are rotations of rolling without slip. `path` is that of the centre.
+/// determine them, or shows that it rolls: `rolls` are rotations of rolling without slip. `path` is that of the centre.
 pub(super) fn turns(
     views: &[&ObjectView],
     path: &BTreeMap<usize, DVec3>,
@@ -113,20 +113,20 @@ pub(super) fn turns(
     };
     take_light_away(&mut sides, moves);
     let (found, least) = if are_surrounded {
-        (turns_by_themselves(&sides)?, TOLD_OF_ANY)
+        (turns_by_themselves(&sides)?, LEAST_AGREEMENT_OF_ANY)
     } else {
-        (followed_turns(&sides)?, TOLD)
+        (followed_turns(&sides)?, LEAST_AGREEMENT)
     };
-    let told = agreement(&sides, &found);
+    let agreed = agreement(&sides, &found);
     let agrees = |roll: &BTreeMap<usize, DQuat>| -> f64 {
         agreement(&sides, &sides.iter().map(|side| roll[&side.time]).collect::<Vec<_>>())
     };
     let rolls = rolls.iter().map(agrees).fold(0.0, f64::max);
-    let rests = agreement(&sides, &vec![DQuat::IDENTITY; sides.len()]);
-    let is_told = told > least.max(RESTS * rests)
-        && rolls < ROLLS * told
-        && told.sqrt() * Side::strength(&sides) > FAINT;
-    is_told.then(|| sides.iter().map(|side| side.time).zip(found).collect())
+    let at_rest = agreement(&sides, &vec![DQuat::IDENTITY; sides.len()]);
+    let is_clear = agreed > least.max(ABOVE_REST * at_rest)
+        && rolls < ROLLS * agreed
+        && agreed.sqrt() * Side::strength(&sides) > FAINT;
+    is_clear.then(|| sides.iter().map(|side| side.time).zip(found).collect())
 }
 
 /// Rotations of all sides that make one texture of them.
@@ -136,7 +136,7 @@ fn followed_turns(sides: &[Side]) -> Option<Vec<DQuat>> {
     let mut turns = grown(sides, &evens, best, Texture::empty());
     refine(sides, &mut turns);
     for _ in 0..AGAIN {
-        turns = grown(sides, &evens, best, well_told(sides, &turns));
+        turns = grown(sides, &evens, best, consistent(sides, &turns));
         refine(sides, &mut turns);
     }
     Some(turns)
@@ -253,7 +253,7 @@ fn evenest(sides: &[Side], of: &[Vec<Agreeing>]) -> Vec<DQuat> {
 }
 
 /// Texture without sides that agree least with the others, which may be turned wrongly.
-fn well_told(sides: &[Side], turns: &[DQuat]) -> Texture {
+fn consistent(sides: &[Side], turns: &[DQuat]) -> Texture {
     let own: Vec<Texture> = sides.iter().zip(turns).map(|(side, turn)| Texture::of(side, *turn)).collect();
     let mut all = Texture::empty();
     own.iter().for_each(|own| all.add(own));

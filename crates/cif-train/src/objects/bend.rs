@@ -50,17 +50,17 @@ impl Bend {
         [1.0, x, y, z, x * x, y * y, z * z, x * y, y * z, z * x]
     }
 
-    /// Knots beside a time, with their weights.
-    fn beside(&self, time: usize) -> [(usize, f64); 2] {
+    /// Knots around a time, with their weights.
+    fn knots_around(&self, time: usize) -> [(usize, f64); 2] {
         let (before, rest) = ((time - self.first) / KNOT, (time - self.first) % KNOT);
         let share = rest as f64 / KNOT as f64;
         [(before, 1.0 - share), (before + 1, share)]
     }
 
     fn shifted(&self, time: usize, places: &[DVec3]) -> Vec<DVec3> {
-        let beside = self.beside(time);
+        let near = self.knots_around(time);
         let coefficients: [DVec3; TERMS] =
-            std::array::from_fn(|k| beside.iter().map(|(knot, weight)| *weight * self.knots[*knot][k]).sum());
+            std::array::from_fn(|k| near.iter().map(|(knot, weight)| *weight * self.knots[*knot][k]).sum());
         let shift = |place: &DVec3| -> DVec3 {
             self.terms(*place).iter().zip(coefficients).map(|(term, coefficient)| *term * coefficient).sum()
         };
@@ -75,7 +75,7 @@ impl Bend {
                 *sum += term * *gradient;
             }
         }
-        for (knot, weight) in self.beside(time) {
+        for (knot, weight) in self.knots_around(time) {
             let values = sums.iter().flat_map(|sum| (weight * *sum).to_array());
             let coefficients = &mut self.knots[knot];
             self.moments[knot].step(values, rate * self.size, |k, step| coefficients[k / 3][k % 3] -= step);

@@ -1,4 +1,4 @@
-//! The ball that masks of an object that rests show, as that of a globe on its stand: discs within them, of which all
+//! The ball that masks of an object at rest show, as that of a globe on its stand: discs within them, of which all
 //! views agree where they are, and how large.
 
 use std::f64::consts::TAU;
@@ -57,7 +57,7 @@ struct Disc {
     share: f64,
 }
 
-/// The ball on a stand that an object is which rests; `None` where its masks show none.
+/// The ball of an object at rest that is a ball on a stand; `None` where its masks show none.
 pub(super) fn ball<'a>(views: impl Iterator<Item = &'a ObjectView>) -> Option<Ball> {
     let mut rng = stream(0, Purpose::Objects, 0);
     let discs: Vec<(&ObjectView, Disc)> =
@@ -109,7 +109,7 @@ fn disc(crop: &Crop, rng: &mut Pcg64) -> Option<Disc> {
     let is_own = |x: usize, y: usize| crop.mask[y * width + x] > 0.5;
     let is_known = |x: usize, y: usize| crop.known[y * width + x] > 0.5;
     let centre = |x: usize, y: usize| DVec2::new(x as f64 + 0.5, y as f64 + 0.5);
-    // Between pixels of the object and those beside them of nothing.
+    // Between pixels of the object and adjacent ones of nothing.
     let mut outline = Vec::new();
     for (x, y) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))) {
         for (a, b) in [(x + 1, y), (x, y + 1)] {

@@ -194,7 +194,7 @@ impl Fit<'_> {
         sum / weights.max(1e-12)
     }
 
-    /// A step on a view: its Gaussians at `rate`, unless they stay, its pose and those beside it at `pose_rate`.
+    /// A step on a view: its Gaussians at `rate`, unless they stay, its pose and those next to it at `pose_rate`.
     pub(super) fn step(&mut self, view: usize, level: usize, rate: Option<f64>, pose_rate: f64) {
         let view = &self.views[view];
         let time = view.time_index;
@@ -247,8 +247,8 @@ impl Fit<'_> {
         of_turns.step(values(gradient.turn), POSE_RATE * rate, |k, step| turn[k] = -step);
         let rate = POSE_RATE * rate * self.size();
         if self.one_camera && !self.air.is_empty() {
-            // Along the axes of the camera: off its support, nothing but its size tells how far away it is, which is
-            // weak beside what tells its place in the image.
+            // Along the axes of the camera: off its support, nothing but its size shows how far away it is, which is
+            // weak compared with what shows its place in the image.
             let axes = view.camera.camera_from_world.rotation;
             of_shifts.step(values(axes * gradient.translation), rate, |k, step| shift[k] = -step);
             shift.z *= DEPTH_RATE;
@@ -267,7 +267,7 @@ impl Fit<'_> {
         }
     }
 
-    /// Steps over views in a shuffled order, again and again; `rates` tell those of Gaussians and poses, and the
+    /// Steps over views in a shuffled order, again and again; `rates` gives those of Gaussians and poses, and the
     /// level, by the share of the steps done.
     pub(super) fn steps(&mut self, views: &[usize], count: usize, rates: impl Fn(f64) -> (f64, f64, usize)) {
         let mut order = views.to_vec();
@@ -303,7 +303,7 @@ impl Fit<'_> {
                     && !self.stays
                     && let (Some(from), Some(to), Some(place)) = (path(a), path(b), path(time))
                 {
-                    // Beside the path as its neighbours are.
+                    // Offset from the path as its neighbours are.
                     pose.translation += place - from.lerp(to, share);
                 }
                 pose
@@ -335,7 +335,7 @@ impl Fit<'_> {
         (turn.length() > LONG && rest.length() < LEADS).then_some([turn, rest])
     }
 
-    /// Fills the gaps across which it turns far. Across others the poses that are trained on either side tell what lies
+    /// Fills the gaps across which it turns far. Across others the poses that are trained on either side show what lies
     /// between.
     pub(super) fn fill_long_turns(&mut self) {
         let times: Vec<usize> = self.poses.keys().copied().collect();
@@ -345,7 +345,7 @@ impl Fit<'_> {
         self.poses.extend(filled);
     }
 
-    /// Pose at a time beyond the outermost one, beside another.
+    /// Pose at a time beyond the outermost one, from its neighbour.
     fn beyond(&self, near: usize, far: Option<usize>, time: usize) -> Pose {
         let at = |time: usize| TimedPose { time, pose: self.poses[&time] };
         far.map_or(self.poses[&near], |far| onward(at(near), at(far), time))

@@ -42,7 +42,7 @@ const UNSEEN: f64 = 0.1;
 /// Visible share from which turns are tried.
 const SEEN: f64 = 0.3;
 
-/// Finds poses of further times, nearest to `reference` first, which has one, as others may; `path` tells where the
+/// Finds poses of further times, nearest to `reference` first, which has one, as others may; `path` says where the
 /// object is.
 ///
 /// # Errors
@@ -65,7 +65,7 @@ pub(super) fn follow(
     order.sort_by_key(|time| time.abs_diff(reference));
     if fit.poses.len() > 1 {
         let known: Vec<usize> = fit.poses.keys().flat_map(|time| at[time].iter().copied()).collect();
-        // What rests does so exactly.
+        // What is at rest does not move at all.
         let pose_rate = if fit.outline.is_surrounded { 1.0 } else { 0.0 };
         let level = fit.trial_level();
         fit.steps(&known, BEGIN, |share| (if share < 0.5 { 1.0 } else { 0.5 }, pose_rate, level));
@@ -111,7 +111,7 @@ fn carve(fit: &mut Fit<'_>, at: &BTreeMap<usize, Vec<usize>>, steps: usize, pose
     fit.steps(&known, steps, |share| (if share < 0.5 { 1.0 } else { 0.5 }, pose_rate, level));
 }
 
-/// Pose of a time beside those that are known, of which those on the side of `origin` tell how it moves.
+/// Pose of a time next to those that are known, of which those on the side of `origin` show how it moves.
 fn found(fit: &Fit<'_>, time: usize, path: &BTreeMap<usize, DVec3>, views: &[usize], origin: usize) -> Pose {
     let levels = fit.levels();
     let mut known: Vec<usize> =
@@ -203,7 +203,7 @@ fn found(fit: &Fit<'_>, time: usize, path: &BTreeMap<usize, DVec3>, views: &[usi
         );
         refined = moved.collect();
         refined.sort_by(|a, b| a.0.total_cmp(&b.0));
-        // Few pixels tell which are worth more of them.
+        // A few pixels show which are worth more of them.
         refined.truncate(refined.len().div_ceil(2));
     }
     refined.first().map_or(last, |(_, moving)| moving.pose)

@@ -13,7 +13,7 @@ use super::view::look_alike;
 /// Places that are moved onto masks, of those that a time may have.
 const TRIED: usize = 2;
 
-/// Adds the times that are seen, but not reliable, nearest first: where their masks are, near where those beside them or
+/// Adds the times that are seen, but not reliable, nearest first: where their masks are, near where their neighbours or
 /// the path lead.
 pub(super) fn grow(fit: &mut Fit<'_>, path: &BTreeMap<usize, DVec3>) {
     let known: Vec<usize> = fit.poses.keys().copied().collect();
@@ -21,12 +21,12 @@ pub(super) fn grow(fit: &mut Fit<'_>, path: &BTreeMap<usize, DVec3>) {
     rest.sort_by_key(|time| known.iter().map(|known| known.abs_diff(*time)).min());
     // Between times at which it may be off its support, it may.
     let is_off = |time: Option<&usize>| time.is_none_or(|time| fit.air.contains(time));
-    let beside = |time: usize| {
+    let between = |time: usize| {
         let after = known.partition_point(|known| *known < time);
         is_off(known[..after].last()) && is_off(known.get(after))
     };
     let off: Vec<usize> =
-        rest.iter().copied().filter(|time| !fit.air.contains(time) && beside(*time)).collect();
+        rest.iter().copied().filter(|time| !fit.air.contains(time) && between(*time)).collect();
     fit.air.extend(off);
     fit.runs = runs(fit, &rest);
     for time in rest {
@@ -37,19 +37,20 @@ pub(super) fn grow(fit: &mut Fit<'_>, path: &BTreeMap<usize, DVec3>) {
         }
         let guesses = led(fit, time, path);
         let Some(first) = guesses.first().copied() else { continue };
-        let tells = |view: &usize| fit.views[*view].time_index == time && fit.views[*view].tells_place();
-        let views: Vec<usize> = (0..fit.views.len()).filter(tells).collect();
+        let shows_place =
+            |view: &usize| fit.views[*view].time_index == time && fit.views[*view].shows_place();
+        let views: Vec<usize> = (0..fit.views.len()).filter(shows_place).collect();
         let pose = settled(fit, &views, &guesses, TRIED).map_or(first, |(_, pose)| pose);
         fit.poses.insert(time, pose);
     }
 }
 
-/// Runs of times, one after the other, at which all cameras see the same: it rests.
+/// Runs of times, one after the other, at which all cameras see the same: it stands still.
 fn runs(fit: &Fit<'_>, times: &[usize]) -> Vec<Vec<usize>> {
     let mut times = times.to_vec();
     times.sort_unstable();
-    let rests = |a: &usize, b: &usize| look_alike(fit.views, *a, *b);
-    times.chunk_by(rests).filter(|run| run.len() > 1).map(<[usize]>::to_vec).collect()
+    let at_rest = |a: &usize, b: &usize| look_alike(fit.views, *a, *b);
+    times.chunk_by(at_rest).filter(|run| run.len() > 1).map(<[usize]>::to_vec).collect()
 }
 
 /// Poses that a time may have: where its neighbours lead, as the nearest of them, as far from it as the path is, in either

@@ -20,7 +20,7 @@ pub(crate) struct KnownObjects {
     pub(crate) rigid: BTreeMap<u16, Found>,
     /// Their parts on joints; `None` where they have none.
     pub(crate) parts: BTreeMap<u16, Option<Jointed>>,
-    /// True once all objects were tried for motion; a state of version 1 does not tell.
+    /// True once all objects were tried for motion; a state of version 1 does not say.
     #[serde(default)]
     pub(crate) is_searched: bool,
 }
@@ -51,7 +51,7 @@ impl KnownObjects {
         self.moving(label).is_some() || self.jointed(label).is_some()
     }
 
-    /// Keeps that an object rests but for a part that turns in place.
+    /// Keeps that an object stands still but for a part that turns in place.
     pub(crate) fn insert_turning(&mut self, label: u16, part: Jointed) {
         self.rigid.insert(label, Found::Nothing);
         self.parts.insert(label, Some(part));

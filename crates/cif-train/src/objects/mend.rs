@@ -7,11 +7,11 @@ use super::view::median;
 use crate::error::TrainError;
 use crate::phases::Phases;
 
-/// Turn per time, degrees, and shift, of the size, from which poses may jump, and how much more than the usual ones
+/// Turn per time, degrees, and shift, of the size, from which poses may jump, and how much more than the typical ones
 /// around them.
 const JUMP: (f64, f64, f64) = (8.0, 0.1, 2.5);
 
-/// Steps from one time to the next, before and after, among which one is usual.
+/// Steps from one time to the next, before and after, among which one is typical.
 const AROUND: usize = 5;
 
 /// Steps of a pose from where the times before it lead.
@@ -26,8 +26,8 @@ const MOST: [f64; 2] = [1.1, 1.5];
 /// Turn, degrees, and distance, of the size, from the present pose up to which a jump is closed.
 const CLOSED: (f64, f64) = (8.0, 0.1);
 
-/// Visible share below which a view does not tell one pose from another.
-const TOLD: f64 = 0.2;
+/// Visible share below which a view does not distinguish poses.
+const SEEN: f64 = 0.2;
 
 /// Follows the object anew across jumps, from either side, as far as that explains more than the poses it has.
 ///
@@ -52,15 +52,15 @@ fn jumps(fit: &Fit<'_>, times: &[usize]) -> Vec<usize> {
         (turn / steps, shift / steps)
     };
     let speeds: Vec<(f64, f64)> = times.windows(2).map(speed).collect();
-    let usual = |k: usize, of: fn(&(f64, f64)) -> f64| {
+    let typical = |k: usize, of: fn(&(f64, f64)) -> f64| {
         let near = k.saturating_sub(AROUND)..(k + AROUND + 1).min(speeds.len());
         median(&mut speeds[near].iter().map(of).collect::<Vec<_>>())
     };
     let (turn, shift, more) = JUMP;
     let is_jump = |k: &usize| {
         let (turns, shifts) = speeds[*k];
-        (turns > turn && turns > more * usual(*k, |speed| speed.0))
-            || (shifts > shift && shifts > more * usual(*k, |speed| speed.1))
+        (turns > turn && turns > more * typical(*k, |speed| speed.0))
+            || (shifts > shift && shifts > more * typical(*k, |speed| speed.1))
     };
     (0..speeds.len()).filter(is_jump).map(|k| k + 1).collect()
 }
@@ -83,7 +83,7 @@ fn march(fit: &mut Fit<'_>, times: &[usize], known: &[usize]) {
     for time in times.iter().copied() {
         let guesses = led(time, &run);
         let Some(Compared { present, found, pose }) = compared(fit, time, &guesses) else {
-            // It does not tell: onward to those that do.
+            // It decides nothing: onward to those that do.
             run.extend(guesses.last().map(|pose| TimedPose { time, pose: *pose }));
             continue;
         };
@@ -129,10 +129,10 @@ struct Compared {
     pose: Pose,
 }
 
-/// The present pose of a time held against those that guesses lead to; `None` where the time does not tell.
+/// The present pose of a time held against those that guesses lead to; `None` where the time decides nothing.
 fn compared(fit: &Fit<'_>, time: usize, guesses: &[Pose]) -> Option<Compared> {
-    let is_told = |view: &usize| fit.views[*view].time_index == time && fit.views[*view].visible >= TOLD;
-    let views: Vec<usize> = (0..fit.views.len()).filter(is_told).collect();
+    let is_seen = |view: &usize| fit.views[*view].time_index == time && fit.views[*view].visible >= SEEN;
+    let views: Vec<usize> = (0..fit.views.len()).filter(is_seen).collect();
     let (found, pose) = settled(fit, &views, guesses, guesses.len())?;
     let present = loss(fit, &mut fit.shape.copied(), &views, fit.poses.get(&time)?);
     Some(Compared { present, found, pose })

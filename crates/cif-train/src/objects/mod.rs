@@ -13,7 +13,7 @@
 //! | `fit` | its poses and Gaussians, moved together |
 //! | `split` | which views are fitted to, and which judge |
 //! | `priors` | how it moves where pictures say little |
-//! | `texture`, `ball`, `sphere` | how it turns, where its outline does not tell |
+//! | `texture`, `ball`, `sphere` | how it turns, where its outline does not show it |
 //! | `ways` | which ways of moving are tried |
 //! | `sequence` | which values over time cost least |
 //! | `follow` | how it moves from time to time |
@@ -81,7 +81,7 @@ use crate::random::{Purpose, stream};
 /// Distance from a plane within which a point is on it, of the extent of the cameras.
 const ON_PLANE: f64 = 0.005;
 
-/// The plane that objects of a capture stand on, among points of what rests; `None` where no plane has enough of them.
+/// The plane that objects of a capture stand on, among points of what is at rest; `None` where no plane has enough of them.
 pub(crate) fn support(dataset: &Dataset, points: &[[f32; 3]], seed: u64) -> Option<Plane> {
     let rng = stream(seed, Purpose::Objects, 0);
     plane::support(&doubles(points), &cameras(dataset), ON_PLANE * dataset.extent(), rng)
@@ -125,15 +125,15 @@ pub(crate) fn up(dataset: &Dataset) -> DVec3 {
 pub(crate) enum Found {
     /// Its motion as a whole.
     Moves(Box<Fitted>),
-    /// It rests, but for a part that turns in place.
+    /// It stands still, but for a part that turns in place.
     Turns(Box<Jointed>),
-    /// It rests, or its masks do not tell enough.
+    /// It is at rest, or its masks do not show enough.
     Nothing,
-    /// Nothing tells how far away it is: one camera sees it, from one side, and no support is known.
+    /// Nothing shows how far away it is: one camera sees it, from one side, and no support is known.
     Nowhere,
 }
 
-/// Fits one object (a label: dense index + 1); one that rests is fitted only where it is told to be rigid, or where it is
+/// Fits one object (a label: dense index + 1); one at rest is fitted only where it is declared rigid, or where it is
 /// a ball on a stand that turns.
 ///
 /// # Errors
@@ -143,15 +143,15 @@ pub(crate) fn fit(
     dataset: &Dataset,
     frames: &FrameStore,
     surroundings: Surroundings<'_>,
-    is_told: bool,
+    is_declared: bool,
 ) -> Result<Found, TrainError> {
     let views = views_of(label, dataset, frames, surroundings)?;
     let outlines = outlines::outlines(&views, surroundings.plane, surroundings.times);
     if outlines.is_empty() {
         return Ok(if views.is_empty() { Found::Nothing } else { Found::Nowhere });
     }
-    let objects = Object::by_outlines(label, &views, &outlines, is_told, surroundings);
-    if !is_told && let Some(found) = parts::turning_ball(objects[0])? {
+    let objects = Object::by_outlines(label, &views, &outlines, is_declared, surroundings);
+    if !is_declared && let Some(found) = parts::turning_ball(objects[0])? {
         return Ok(Found::Turns(Box::new(found)));
     }
     let fitted = start::fit_object(&objects)?;
@@ -159,8 +159,8 @@ pub(crate) fn fit(
     Ok(fitted.map_or(Found::Nothing, |fitted| Found::Moves(Box::new(fitted))))
 }
 
-/// Finds the part of an object that rests (a label: dense index + 1) which turns on a hinge or slides; `None` where it
-/// has none, or the masks do not tell enough.
+/// Finds the part of an object at rest (a label: dense index + 1) which turns on a hinge or slides; `None` where it
+/// has none, or the masks do not show enough.
 ///
 /// # Errors
 /// As of [`fit`].
@@ -172,7 +172,7 @@ pub(crate) fn find_part(
 ) -> Result<Option<Jointed>, TrainError> {
     let views = views_of(label, dataset, frames, surroundings)?;
     let outlines = outlines::outlines(&views, surroundings.plane, surroundings.times);
-    // It rests: as standing, which is the first of its outlines.
+    // It is at rest: as standing, which is the first of its outlines.
     let object = Object::by_outlines(label, &views, &outlines, false, surroundings).into_iter().next();
     let found = object.map_or(Ok(None), parts::find)?;
     surroundings.phases.check()?;

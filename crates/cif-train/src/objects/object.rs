@@ -50,9 +50,9 @@ pub(super) struct Object<'a> {
     /// In the order of times.
     pub(super) views: &'a [ObjectView],
     pub(super) outline: &'a Outline,
-    /// True where it is told to move as a whole.
-    pub(super) is_told: bool,
-    /// Place of the outline among those that the object may have: those beside the first suggest no ways of moving but
+    /// True where it is declared to move as a whole.
+    pub(super) is_declared: bool,
+    /// Place of the outline among those that the object may have: those after the first suggest no ways of moving but
     /// what following finds.
     pub(super) place: usize,
     /// Number of these outlines: several are compared with all pixels.
@@ -84,14 +84,14 @@ impl<'a> Object<'a> {
         label: u16,
         views: &'a [ObjectView],
         outlines: &'a [Outline],
-        is_told: bool,
+        is_declared: bool,
         surroundings: Surroundings<'a>,
     ) -> Vec<Self> {
         let of = |(place, outline)| Object {
             label,
             views,
             outline,
-            is_told,
+            is_declared,
             place,
             outlines: outlines.len(),
             surroundings,
@@ -158,18 +158,18 @@ impl<'a> Object<'a> {
         times.max_by(|a, b| seen(a).total_cmp(&seen(b)))
     }
 
-    /// Time from which an object is followed to others of its path, among `times`, and the object there: as it rests
+    /// Time from which an object is followed to others of its path, among `times`, and the object there: as it stands
     /// before it is lifted, or after; where it looks from one side to the next as if it did not turn; else as one time
     /// shows it.
     pub(super) fn first(&self, path: &BTreeMap<usize, DVec3>, times: &[usize]) -> Option<(usize, Fit<'a>)> {
         let at = |place: DVec3| Pose { rotation: DQuat::IDENTITY, translation: place };
-        let rests = self.rests(path).into_iter().max_by_key(Vec::len).unwrap_or_default();
-        let rests: Vec<usize> = rests.into_iter().filter(|time| times.contains(time)).collect();
-        let reference = self.best_seen(if rests.is_empty() { times } else { &rests }.iter().copied())?;
+        let at_rest = self.runs_at_rest(path).into_iter().max_by_key(Vec::len).unwrap_or_default();
+        let at_rest: Vec<usize> = at_rest.into_iter().filter(|time| times.contains(time)).collect();
+        let reference = self.best_seen(if at_rest.is_empty() { times } else { &at_rest }.iter().copied())?;
         let mut poses = BTreeMap::from([(reference, at(path[&reference]))]);
-        if !rests.is_empty() {
-            let middle = rests.iter().map(|time| path[time]).sum::<DVec3>() / rests.len() as f64;
-            poses.extend(rests.iter().map(|time| (*time, at(middle))));
+        if !at_rest.is_empty() {
+            let middle = at_rest.iter().map(|time| path[time]).sum::<DVec3>() / at_rest.len() as f64;
+            poses.extend(at_rest.iter().map(|time| (*time, at(middle))));
         } else if self.outline.is_surrounded && is_one_camera(self.views) {
             let mut near = times.to_vec();
             near.sort_by_key(|time| time.abs_diff(reference));
@@ -184,7 +184,7 @@ impl<'a> Object<'a> {
     }
 
     /// Runs of times at which an object stands in one place on its support.
-    pub(super) fn rests(&self, path: &BTreeMap<usize, DVec3>) -> Vec<Vec<usize>> {
+    pub(super) fn runs_at_rest(&self, path: &BTreeMap<usize, DVec3>) -> Vec<Vec<usize>> {
         let air = &self.outline.air;
         let times: Vec<usize> = path.keys().copied().collect();
         let stands = |a: &usize, b: &usize| {
@@ -198,9 +198,9 @@ impl<'a> Object<'a> {
     /// Times at which an object that is followed may be off its support: all at which it does not rest, where it
     /// leaves it at all.
     pub(super) fn may_be_off(&self, path: &BTreeMap<usize, DVec3>) -> Vec<usize> {
-        let rests: Vec<usize> = self.rests(path).into_iter().flatten().collect();
+        let at_rest: Vec<usize> = self.runs_at_rest(path).into_iter().flatten().collect();
         let leaves = !self.outline.air.is_empty();
-        path.keys().copied().filter(|time| leaves && !rests.contains(time)).collect()
+        path.keys().copied().filter(|time| leaves && !at_rest.contains(time)).collect()
     }
 
     /// The place where views see it together.

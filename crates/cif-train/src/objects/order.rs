@@ -35,8 +35,8 @@ pub(super) struct Mask {
     label: u16,
     /// Pixels.
     area: f64,
-    /// Labels beside it, by their shares of its outline.
-    beside: Vec<(u16, f64)>,
+    /// Labels adjacent to it, by their shares of its outline.
+    adjacent: Vec<(u16, f64)>,
 }
 
 impl Order {
@@ -71,7 +71,7 @@ impl Order {
 fn lies_behind<'a>(masks: impl Iterator<Item = &'a Mask>, other: u16) -> bool {
     let (mut surrounded, mut touched) = (Vec::new(), Vec::new());
     for mask in masks {
-        match mask.beside.iter().find(|(label, _)| *label == other) {
+        match mask.adjacent.iter().find(|(label, _)| *label == other) {
             Some((_, share)) if *share >= SURROUNDS => surrounded.push(mask.area),
             Some((_, share)) if *share > TOUCHES && !touches_more(mask, other) => touched.push(mask.area),
             _ => {}
@@ -88,7 +88,7 @@ fn lies_behind<'a>(masks: impl Iterator<Item = &'a Mask>, other: u16) -> bool {
 
 /// True where a mask touches further labels, any of which may hide its object.
 fn touches_more(mask: &Mask, other: u16) -> bool {
-    mask.beside.iter().any(|(label, share)| ![UNLABELLED, other].contains(label) && *share > TOUCHES)
+    mask.adjacent.iter().any(|(label, share)| ![UNLABELLED, other].contains(label) && *share > TOUCHES)
 }
 
 /// Masks of an image.
@@ -100,8 +100,8 @@ fn masks(table: &MaskTable) -> impl Iterator<Item = Mask> {
             *outline.entry(UNLABELLED).or_default() += row.border;
         }
         let whole = f64::from(outline.values().sum::<u32>());
-        let beside = outline.into_iter().map(|(other, pixels)| (other, f64::from(pixels) / whole));
-        Mask { label: *label, area: f64::from(row.pixels), beside: beside.collect() }
+        let adjacent = outline.into_iter().map(|(other, pixels)| (other, f64::from(pixels) / whole));
+        Mask { label: *label, area: f64::from(row.pixels), adjacent: adjacent.collect() }
     })
 }
 

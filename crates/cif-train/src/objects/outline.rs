@@ -26,13 +26,13 @@ pub(super) struct Outline {
     pub(super) air: Vec<usize>,
     /// Weight of the bending of the path: large where depths are guesses.
     pub(super) stiffness: f64,
-    /// True where views of several sides, of one time or of few, tell where it is.
+    /// True where views of several sides, of one time or of few, show where it is.
     pub(super) is_surrounded: bool,
-    /// Times at which the rays of several cameras do not meet, though it stands: it rests, or does beside them.
+    /// Times at which the rays of several cameras do not meet, though it stands: it is at rest, or stands before and after.
     pub(super) held: Vec<usize>,
     /// Those at which they do not, and nothing shows that it stands: its place is a guess.
     pub(super) guessed: Vec<usize>,
-    /// True of what is tried only where no other outline explains what is seen: a plane tells depths better than few
+    /// True of what is tried only where no other outline explains what is seen: a plane gives depths better than few
     /// rays.
     pub(super) is_resort: bool,
 }
@@ -43,7 +43,7 @@ impl Outline {
         self.height.max(self.radius)
     }
 
-    /// Test of places about the centre, as the object stands on a plane: few views do not tell how deep it is, its
+    /// Test of places about the centre, as the object stands on a plane: few views do not show how deep it is, its
     /// outline on the plane does. True of all places without a plane.
     pub(super) fn upright(&self, plane: Option<&Plane>) -> impl Fn(DVec3) -> bool + use<> {
         let (height, radius) = (ROOM * self.height, ROOM * self.radius);

@@ -8,7 +8,7 @@ use glam::{DMat2, DVec2, DVec3};
 use super::outline::{Outline, RAISED, ROOM};
 use super::path;
 use super::plane::Plane;
-use super::view::{ObjectView, WITHIN, are_discs, is_one_camera, median, meeting_point, rests};
+use super::view::{ObjectView, WITHIN, are_discs, is_at_rest, is_one_camera, median, meeting_point};
 
 /// Largest apparent size of a mask, relative to that on the plane, at which its object is taken to touch the plane.
 const AIR: f64 = 1.1;
@@ -24,15 +24,15 @@ const SHORTEST_RUN: usize = 3;
 /// Roundness of rough masks from which they are those of a ball, if they are discs too.
 const BALL: f64 = 0.93;
 
-/// Times before and after one among which its size is the middle one, and the usual change by it, of the size, from which
+/// Times before and after one among which its size is the middle one, and the median change by it, of the size, from which
 /// masks are rough.
 const STEADY: usize = 2;
 const ROUGH: f64 = 0.005;
 
-/// Height of an object in its usual tallest pose, of that in its lowest, from which it may topple.
+/// Height of an object in its typical tallest pose, of that in its lowest, from which it may topple.
 const TOPPLES: f64 = 1.5;
 
-/// Visible share from which a mask tells how high it is.
+/// Visible share from which a mask shows how high it is.
 const MOSTLY_SEEN: f64 = 0.6;
 
 /// Visible share from which what touches a mask is behind it.
@@ -43,7 +43,7 @@ const FULLY_SEEN: f64 = 0.9;
 const BAR: (f64, f64) = (2.2, 0.15);
 
 /// Of so many times the lowest is one at which an object stands, and limits of its height there, of that which its
-/// outlines tell.
+/// outlines imply.
 const LOWEST: usize = 8;
 const STANDS: (f64, f64) = (0.4, 1.5);
 
@@ -67,9 +67,9 @@ enum Stance {
     Topples,
 }
 
-/// Outlines that the views of an object may have; none where nothing tells where it is. Several cameras at a time tell
+/// Outlines that the views of an object may have; none where nothing shows where it is. Several cameras at a time give
 /// one. One camera leaves open whether what looks larger comes nearer or shows a broader side, and whether what looks
-/// lower fell over: pictures decide. Where it sees the object from other sides soon after, rays that cross tell the path
+/// lower fell over: pictures decide. Where it sees the object from other sides soon after, rays that cross give the path
 /// of what leaves the plane. `times` are those of the sequence.
 pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize) -> Vec<Outline> {
     let met = meetings(views);
@@ -117,7 +117,7 @@ fn around(views: &[ObjectView], path: BTreeMap<usize, DVec3>, stiffness: f64) ->
     }
 }
 
-/// Outline of an object that several cameras see, by where their rays meet and by what a plane tells.
+/// Outline of an object that several cameras see, by where their rays meet and by what a plane implies.
 fn met_outline(views: &[ObjectView], plane: Option<&Plane>, met: BTreeMap<usize, DVec3>) -> Outline {
     let on_plane = plane.and_then(|plane| on_plane(views, plane, Stance::MayLeave));
     let mut outline = match on_plane {
@@ -135,16 +135,16 @@ fn met_outline(views: &[ObjectView], plane: Option<&Plane>, met: BTreeMap<usize,
     outline
 }
 
-/// Puts an object that few of several cameras see where it stands: at times beside which it does where their rays meet, and
-/// at those at which it rests.
+/// Puts an object that few of several cameras see where it stands: at times next to which it does where their rays meet, and
+/// at those at which it is at rest.
 fn stand(outline: &mut Outline, views: &[ObjectView], plane: &Plane, met: &BTreeMap<usize, DVec3>) {
     let stands =
         |(_, centre): (&usize, &DVec3)| (plane.height(*centre) / outline.height - 1.0).abs() < RAISED;
-    let beside = |time: usize| {
+    let neighbours_stand = |time: usize| {
         met.range(..time).next_back().is_none_or(stands) && met.range(time..).next().is_none_or(stands)
     };
     let held = outline.path.keys().copied().filter(|time| !met.contains_key(time));
-    let held: Vec<usize> = held.filter(|time| beside(*time) || rests(views, *time)).collect();
+    let held: Vec<usize> = held.filter(|time| neighbours_stand(*time) || is_at_rest(views, *time)).collect();
     for time in &held {
         let largest = views
             .iter()
@@ -185,17 +185,18 @@ fn raised(outline: &Outline, plane: &Plane) -> Vec<usize> {
 }
 
 /// Height above the plane at which an object stands whose centres are known: the middle one of times that are about as low
-/// as its lowest ones. `None` where these are few and differ, or far from what its outlines tell, so that it may never stand.
-fn standing_height(met: &BTreeMap<usize, DVec3>, plane: &Plane, told: f64) -> Option<f64> {
+/// as its lowest ones. `None` where these are few and differ, or far from what its outlines imply, so that it may
+/// never stand.
+fn standing_height(met: &BTreeMap<usize, DVec3>, plane: &Plane, implied: f64) -> Option<f64> {
     let mut heights: Vec<f64> = met.values().map(|centre| plane.height(*centre)).collect();
     heights.sort_by(f64::total_cmp);
     let [lowest, highest] = [*heights.first()?, *heights.last()?];
-    // Few tell it where all are as high.
+    // Few suffice where all are as high.
     let are_alike = heights.len() >= SHORTEST_RUN && highest < ROOM * lowest;
     let low = *heights.get(heights.len() / LOWEST).filter(|_| heights.len() >= LOWEST || are_alike)?;
     heights.retain(|height| *height < ROOM * low);
     let height = median(&mut heights);
-    (STANDS.0 * told..STANDS.1 * told).contains(&height).then_some(height)
+    (STANDS.0 * implied..STANDS.1 * implied).contains(&height).then_some(height)
 }
 
 /// Centres at times that several cameras see, where their rays meet.
@@ -209,8 +210,8 @@ fn meetings(views: &[ObjectView]) -> BTreeMap<usize, DVec3> {
     several.filter_map(|(time, views)| Some((time, meeting_point(views.into_iter())?))).collect()
 }
 
-/// Outline of the views of an object on a plane; `None` where no mask is seen from above, or nothing tells that it moves
-/// in this way.
+/// Outline of the views of an object on a plane; `None` where no mask is seen from above, or nothing shows that it moves
+/// like this.
 fn on_plane(views: &[ObjectView], plane: &Plane, stance: Stance) -> Option<Outline> {
     let is_whole = |view: &&ObjectView| view.is_whole() || (!view.cut && view.visible >= FULLY_SEEN);
     let whole: Vec<&ObjectView> = match views.iter().filter(is_whole).collect::<Vec<_>>() {
@@ -305,7 +306,7 @@ fn steady_sizes(views: &[ObjectView], plane: &Plane, height: f64) -> Vec<Option<
 }
 
 /// Heights of the centre by view, as the masks of a few times imply them; `None` where they hardly change.
-fn steady_heights(views: &[ObjectView], plane: &Plane, usual: f64) -> Option<Vec<f64>> {
+fn steady_heights(views: &[ObjectView], plane: &Plane, typical: f64) -> Option<Vec<f64>> {
     let of = |view: &ObjectView| {
         let is_seen = !view.cut && view.visible >= MOSTLY_SEEN;
         let reading = is_seen.then(|| read(view, plane, false)).flatten();
@@ -315,7 +316,7 @@ fn steady_heights(views: &[ObjectView], plane: &Plane, usual: f64) -> Option<Vec
     let middle = |k: usize| {
         let near = k.saturating_sub(STEADY)..(k + STEADY + 1).min(heights.len());
         let mut near: Vec<f64> = heights[near].iter().flatten().copied().collect();
-        if near.is_empty() { usual } else { median(&mut near) }
+        if near.is_empty() { typical } else { median(&mut near) }
     };
     let steady: Vec<f64> = (0..heights.len()).map(middle).collect();
     let mut sorted = steady.clone();
@@ -449,11 +450,11 @@ mod tests {
 
     const RADIUS: f64 = 0.05;
 
-    /// A plain ball that rests on the floor, at one time or at all.
+    /// A plain ball at rest on the floor, at one time or at all.
     fn ball(times: usize, cameras: super::super::testing::Cameras) -> Vec<ObjectView> {
-        let rests = (DQuat::IDENTITY, DVec3::new(0.0, 0.0, RADIUS));
+        let at_rest = (DQuat::IDENTITY, DVec3::new(0.0, 0.0, RADIUS));
         let mut all =
-            views(solid(&sphere_places(RADIUS), |_| [0.8, 0.5, 0.2], 0.006), &[rests; TIMES], cameras);
+            views(solid(&sphere_places(RADIUS), |_| [0.8, 0.5, 0.2], 0.006), &[at_rest; TIMES], cameras);
         all.retain(|view| view.time_index < times);
         all
     }
@@ -472,7 +473,7 @@ mod tests {
             errors.fold(0.0, f64::max)
         };
         assert!(error(&views) < 0.03, "{} m", error(&views));
-        // Hidden in part, they do not tell its size.
+        // Hidden in part, they do not show its size.
         views.iter_mut().filter(|view| view.time_index < 12).for_each(|view| view.visible = 0.6);
         assert!(error(&views) > 0.1, "{} m", error(&views));
     }
@@ -529,7 +530,7 @@ mod tests {
         let found = outlines(&seen(1.5 * RADIUS), Some(&FLOOR), TIMES);
         let crossing = found.iter().find(|outline| outline.is_surrounded).unwrap();
         assert_eq!(crossing.air.len(), crossing.path.len());
-        // Without a plane nothing tells.
+        // Without a plane nothing shows it.
         let found = outlines(&views, None, TIMES);
         assert!(found[0].is_surrounded && found[0].air.is_empty());
     }
@@ -549,7 +550,7 @@ mod tests {
         assert_eq!(standing_height(&(4..10).map(lifted).collect(), &FLOOR, 0.07), None);
         // Unless all are as high.
         assert_eq!(standing_height(&(0..5).map(lifted).collect(), &FLOOR, 0.07), Some(0.05));
-        // Outlines of a ball tell its height worse than the places where its rays meet.
+        // Outlines of a ball give its height less well than the places where its rays meet.
         let found = outlines(&ball(TIMES, rig), Some(&FLOOR), TIMES).remove(0);
         assert!((found.height - RADIUS).abs() < 0.002, "{}", found.height);
     }

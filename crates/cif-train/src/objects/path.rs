@@ -18,20 +18,20 @@ pub(super) const CROSSING: f64 = 0.01;
 /// Weight of a time whose masks are all cut by the border.
 pub(super) const CUT: f64 = 0.05;
 
-/// Distance of a place from between those before and after, in sizes and in usual ones, from which it is aside, and the
+/// Distance of a place from between those before and after, in sizes and in median ones, from which it is aside, and the
 /// largest share of such places.
 const ASIDE: f64 = 1.0;
-const OF_USUAL: f64 = 5.0;
+const OF_MEDIAN: f64 = 5.0;
 const ASIDE_SHARE: f64 = 0.2;
 
 /// Times on either side among which rays cross, and the angle from which they do, radians.
-const BESIDE: usize = 2;
+const NEIGHBOURS: usize = 2;
 const CROSSES: f64 = 0.7;
 
 /// Distance of a ray from the path, in reaches of its mask, from which this shows something else.
 const ELSEWHERE: f64 = 2.0;
 
-/// Times on either side of one that tell where it belongs.
+/// Times on either side of one that show where it belongs.
 const LED_BY: usize = 6;
 
 /// Rounds of reweighting of rays, by their distances from the path.
@@ -72,7 +72,7 @@ pub(super) fn smooth(
     even(&keys, &near, &vec![outline.stiffness; keys.len()], times).unwrap_or_else(|| raw.clone())
 }
 
-/// Parts of a path that lie far from where those beside them lead, which `missed` tells of one of those that are left: by
+/// Parts of a path that lie far from where their neighbours lead, which `missed` gives for one of those that are left: by
 /// what distance, and what is far; `None` where nothing leads.
 fn aside<T>(mut kept: Vec<T>, missed: impl Fn(&[T], usize) -> Option<(f64, f64)>) -> Vec<T> {
     let most = (ASIDE_SHARE * kept.len() as f64) as usize;
@@ -81,7 +81,7 @@ fn aside<T>(mut kept: Vec<T>, missed: impl Fn(&[T], usize) -> Option<(f64, f64)>
         let missed: Vec<Option<(f64, f64)>> = (0..kept.len()).map(|k| missed(&kept, k)).collect();
         let middle =
             |of: fn(&(f64, f64)) -> f64| median(&mut missed.iter().flatten().map(of).collect::<Vec<_>>());
-        let far = middle(|missed| missed.1).max(OF_USUAL * middle(|missed| missed.0));
+        let far = middle(|missed| missed.1).max(OF_MEDIAN * middle(|missed| missed.0));
         let distance = |k: &usize| missed[*k].map_or(0.0, |(distance, _)| distance);
         let largest = (0..kept.len()).max_by(|a, b| distance(a).total_cmp(&distance(b)));
         let Some(k) = largest.filter(|k| distance(k) > far) else { break };
@@ -92,7 +92,7 @@ fn aside<T>(mut kept: Vec<T>, missed: impl Fn(&[T], usize) -> Option<(f64, f64)>
 
 /// Times at which a path of an object of this size jumps aside, and back.
 fn places_aside(raw: &BTreeMap<usize, DVec3>, size: f64) -> BTreeSet<usize> {
-    // From between those beside it; at the ends from where the next two lead.
+    // From between its neighbours; at the ends from where the next two lead.
     let jump = |kept: &[usize], k: usize| {
         let last = kept.len() - 1;
         let [a, b] = if k == 0 {
@@ -118,13 +118,13 @@ pub(super) fn crossing(views: &[ObjectView], times: usize) -> BTreeMap<usize, DV
 }
 
 /// The same, where it is known whether it bounces: the middle of its masks is then sure, so that a path that bends
-/// somewhere is found before rays are told to be off it. Nothing else tells where its ends are.
+/// somewhere is found before rays are taken to be off it. Nothing else shows where its ends are.
 fn along_rays(views: &[ObjectView], times: usize, bounces: bool) -> BTreeMap<usize, DVec3> {
     let mut views: Vec<&ObjectView> = views.iter().filter(|view| !view.cut).collect();
     let rays: Vec<DVec3> = views.iter().map(|view| view.ray().direction).collect();
     let widest = |k: usize| {
-        let beside = k.saturating_sub(BESIDE)..=(k + BESIDE).min(rays.len() - 1);
-        beside.map(|other| rays[k].angle_between(rays[other])).fold(0.0, f64::max)
+        let near = k.saturating_sub(NEIGHBOURS)..=(k + NEIGHBOURS).min(rays.len() - 1);
+        near.map(|other| rays[k].angle_between(rays[other])).fold(0.0, f64::max)
     };
     let mut angles: Vec<f64> = (0..rays.len()).map(widest).collect();
     let is_one_camera = views.windows(2).all(|pair| pair[0].time_index != pair[1].time_index);
@@ -165,16 +165,16 @@ fn along_rays(views: &[ObjectView], times: usize, bounces: bool) -> BTreeMap<usi
     path
 }
 
-/// Distance of the ray of a view from the path of those around it, of those that usual gaps between them leave open, and
-/// that at which its mask shows something else; `None` near the ends, and where these do not tell.
+/// Distance of the ray of a view from the path of those around it, of those that typical gaps between them leave open, and
+/// that at which its mask shows something else; `None` near the ends, and where these do not show it.
 fn missed(views: &[&ObjectView], at: usize, times: usize) -> Option<(f64, f64)> {
-    if at < BESIDE || at + BESIDE >= views.len() {
+    if at < NEIGHBOURS || at + NEIGHBOURS >= views.len() {
         return None;
     }
     let near = at.saturating_sub(LED_BY)..(at + LED_BY + 1).min(views.len());
     let time = |k: usize| views[k].time_index as f64;
-    let usual = (time(views.len() - 1) - time(0)) / (views.len() - 1) as f64;
-    let gap = ((time(at + 1) - time(at - 1)) / (2.0 * usual)).max(1.0);
+    let mean_gap = (time(views.len() - 1) - time(0)) / (views.len() - 1) as f64;
+    let gap = ((time(at + 1) - time(at - 1)) / (2.0 * mean_gap)).max(1.0);
     let keys: Vec<usize> = views[near.clone()].iter().map(|view| view.time_index).collect();
     let of = |k: usize| ray(views[k], if k == at { 0.0 } else { weight(views[k]) });
     let rays: Vec<(DMat3, DVec3)> = near.map(of).collect();

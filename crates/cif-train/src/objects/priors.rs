@@ -105,14 +105,14 @@ impl Fit<'_> {
         }
     }
 
-    /// True where it is held to its support, as nothing else tells its distance: neither several cameras nor rays of one
+    /// True where it is held to its support, as nothing else shows its distance: neither several cameras nor rays of one
     /// that cross.
     pub(super) fn is_held(&self) -> bool {
         self.plane.is_some() && !self.stays && self.one_camera && !self.outline.is_surrounded
     }
 
     /// Gradients, by the pose and by the centres, that put the lowest Gaussians onto the plane, or no deeper at times off
-    /// the plane; `None` where nothing needs to move, and where several cameras tell the distance.
+    /// the plane; `None` where nothing needs to move, and where several cameras give the distance.
     pub(super) fn contact(
         &self,
         shape: &Shape,

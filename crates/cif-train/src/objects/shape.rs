@@ -22,7 +22,7 @@ const SCALES: [f64; 2] = [0.02, 0.3];
 /// Range of opacity logits.
 const OPACITIES: [f32; 2] = [-4.0, 5.0];
 
-/// Weight of the coverage, beside that of colours.
+/// Weight of the coverage, relative to that of colours.
 const COVERAGE: f32 = 0.5;
 
 /// Differences of colours and of coverage below which the loss is quadratic.
@@ -166,10 +166,10 @@ impl Shape {
     }
 
     /// Lowers the opacity of Gaussians at some places to `logit`.
-    pub(super) fn fade(&mut self, logit: f32, wanted: impl Fn(DVec3) -> bool) {
+    pub(super) fn fade(&mut self, logit: f32, selected: impl Fn(DVec3) -> bool) {
         let g = &mut self.field.gaussians;
         for (mean, opacity) in g.means.iter().zip(&mut g.opacity_logits) {
-            if wanted(DVec3::from_array(mean.map(f64::from))) {
+            if selected(DVec3::from_array(mean.map(f64::from))) {
                 *opacity = opacity.min(logit);
             }
         }

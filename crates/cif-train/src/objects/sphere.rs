@@ -25,7 +25,7 @@ const HIGHLIGHT: f64 = 4.0;
 /// Cells along the edges of the cube that a texture is kept on.
 const CELLS: usize = 10;
 
-/// Weight of places that are not seen, so that a few that agree by chance do not tell.
+/// Weight of places that are not seen, so that a few that agree by chance do not decide.
 const UNSEEN: f64 = 0.1;
 
 /// A place of the sphere at one time.
@@ -91,7 +91,7 @@ fn samples(view: &ObjectView, centre: DVec3, radius: f64) -> Vec<Sample> {
     let crop = &view.crops[0];
     let origin = view.camera.centre();
     let distance = (centre - origin).length();
-    // A whole outline tells where the middle is and how large the ball looks.
+    // A whole outline shows where the middle is and how large the ball looks.
     let (centre, radius) = if view.is_whole() {
         let pixels = (view.area() / PI).sqrt();
         let sine = (pixels / view.camera.focal_px.x).atan().sin();

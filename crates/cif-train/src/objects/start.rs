@@ -26,13 +26,13 @@ use super::view::{ObjectView, median};
 use super::ways::{Way, rolled};
 use crate::error::TrainError;
 
-/// Reliable times below which ways of moving cannot be told apart.
+/// Reliable times below which ways of moving cannot be distinguished.
 const FEWEST_TIMES: usize = 8;
 
 /// Times at which an object must be seen to be followed.
 const FEWEST_SEEN: usize = 5;
 
-/// Views at the beginning and the end of which all must show an object elsewhere than where it rests, if it is.
+/// Views at the beginning and the end of which all must show an object elsewhere than where it is at rest, if it is.
 const AT_ENDS: usize = 2;
 
 /// Error from which an outline does not explain what is seen.
@@ -76,7 +76,7 @@ pub(crate) struct Fitted {
     pub(crate) way: String,
 }
 
-/// Fits an object that has one of several outlines; `None` where it rests, or its masks do not tell enough.
+/// Fits an object that has one of several outlines; `None` where it is at rest, or its masks do not show enough.
 ///
 /// # Errors
 /// [`TrainError::Stopped`] when the run is to stop.
@@ -148,13 +148,13 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
         bent,
         is_ball: outline.roundness >= 1.0,
         is_settled: outline.is_surrounded && fit.one_camera,
-        way: way.told(),
+        way: way.in_words(),
     }))
 }
 
 impl<'a> Object<'a> {
-    /// The object in the best way of moving along the path of its outline; `None` where it rests, or its masks do not
-    /// tell enough.
+    /// The object in the best way of moving along the path of its outline; `None` where it is at rest, or its masks do not
+    /// show enough.
     pub(super) fn begun(self) -> Result<Option<Started<'a>>, TrainError> {
         let Object { views, outline, .. } = self;
         let path = smooth(&outline.path, views, self.surroundings.times, outline);
@@ -171,7 +171,7 @@ impl<'a> Object<'a> {
         Ok(found)
     }
 
-    /// True of what rests while it is seen well, but is elsewhere when it is seen first, or last.
+    /// True of what stands still while it is seen well, but is elsewhere when it is seen first, or last.
     fn comes_or_goes(&self, path: &BTreeMap<usize, DVec3>, reliable: &[usize]) -> bool {
         let Some(place) = self.resting_place(reliable) else { return false };
         let seen: Vec<&ObjectView> = self.views_at(path).map(|view| &self.views[view]).collect();
@@ -194,7 +194,7 @@ impl<'a> Object<'a> {
         follow(&mut fit, reference, &path, &all, self.surroundings.phases)?;
         let error = fit.mean_loss(&all, 0);
         let stays = |bent: f64| bent <= trials::BENDS_IN_PLACE * error;
-        if !self.is_told && self.bent_in_place(&all).is_some_and(stays) {
+        if !self.is_declared && self.bent_in_place(&all).is_some_and(stays) {
             return Ok(None);
         }
         let rotation = if self.shows(&path, &fit.poses) {
@@ -222,8 +222,8 @@ impl<'a> Object<'a> {
 
     /// Error of the object bending in one place, on the views that it is fitted to.
     fn bent_in_place(&self, views: &[usize]) -> Option<f64> {
-        let rests = Pose { rotation: DQuat::IDENTITY, translation: self.resting_place(views)? };
-        let poses = views.iter().map(|k| (self.views[*k].time_index, rests)).collect();
+        let at_rest = Pose { rotation: DQuat::IDENTITY, translation: self.resting_place(views)? };
+        let poses = views.iter().map(|k| (self.views[*k].time_index, at_rest)).collect();
         let shape = self.hull(&poses, FOLLOWED, &mut self.rng())?;
         let mut fit = self.fit(poses, shape, self.rng());
         fit.turns = Turns::Given;
@@ -242,15 +242,16 @@ fn shares(fit: &mut Fit<'_>) -> BTreeMap<usize, f64> {
         let (most, worst) = seen.entry(time).or_default();
         (*most, *worst) = (most.max(visible), worst.max(loss));
     }
-    let usual = median(&mut seen.values().map(|(_, loss)| *loss).collect::<Vec<_>>());
-    let of =
-        |time: &usize| seen.get(time).map_or(LEAST_SHARE, |(visible, loss)| share(*visible, loss / usual));
+    let median_loss = median(&mut seen.values().map(|(_, loss)| *loss).collect::<Vec<_>>());
+    let of = |time: &usize| {
+        seen.get(time).map_or(LEAST_SHARE, |(visible, loss)| share(*visible, loss / median_loss))
+    };
     fit.poses.keys().map(|time| (*time, of(time))).collect()
 }
 
-/// Share of the way that training may move a pose at whose time a share of the object is visible, by its loss over the usual
-/// one: the less is seen the less, as slivers lead the pose astray, and with it those at times that do not show the object,
-/// which follow; and little where it is explained as well as usually.
+/// Share of the way that training may move a pose at whose time a share of the object is visible, by its loss over the
+/// median one: the less is seen the less, as slivers lead the pose astray, and with it those at times that do not show the
+/// object, which follow; and little where it is explained as well as is typical.
 fn share(visible: f64, loss: f64) -> f64 {
     visible * (1.0 - (1.0 - LEAST_SHARE) * loss.max(1.0).powi(-2))
 }

@@ -102,14 +102,14 @@ fn a_textured_ball_is_found_to_roll_and_a_plain_one_is_assumed_to() {
     assert_eq!(plain.rotation, RotationEvidence::Assumed, "{}, {}", plain.way, plain.error);
     assert!(plain.way.starts_with("rolls"), "{}", plain.way);
     let (turn, shift) = errors(&plain.poses, &truth);
-    // Nothing but its outline, of 30 pixels, tells how far it went: 400 degrees.
+    // Nothing but its outline, of 30 pixels, shows how far it went: 400 degrees.
     assert!(turn < 60.0 && shift < 0.015, "{turn} deg, {shift} m");
 }
 
 #[test]
-fn what_rests_is_left_alone() {
-    let rests = vec![(DQuat::from_rotation_z(0.4), DVec3::new(0.05, 0.02, 0.05)); TIMES];
-    assert!(fit_on(Some(&FLOOR), &views(solid(&box_places(), patches, 0.006), &rests, moving)).is_none());
+fn what_is_at_rest_is_left_alone() {
+    let at_rest = vec![(DQuat::from_rotation_z(0.4), DVec3::new(0.05, 0.02, 0.05)); TIMES];
+    assert!(fit_on(Some(&FLOOR), &views(solid(&box_places(), patches, 0.006), &at_rest, moving)).is_none());
 }
 
 /// Views of a solid in masks that lie up to some pixels beside it, on another side of it every time.
@@ -127,19 +127,19 @@ fn rough_views(solid: Gaussians, poses: &[(DQuat, DVec3)], cameras: Cameras, mos
 }
 
 #[test]
-fn what_rests_in_rough_masks_is_left_alone() {
-    let rests = vec![(DQuat::from_rotation_z(0.4), DVec3::new(0.05, 0.02, 0.05)); TIMES];
-    let views = rough_views(solid(&box_places(), patches, 0.006), &rests, jumping, 4);
+fn what_is_at_rest_in_rough_masks_is_left_alone() {
+    let at_rest = vec![(DQuat::from_rotation_z(0.4), DVec3::new(0.05, 0.02, 0.05)); TIMES];
+    let views = rough_views(solid(&box_places(), patches, 0.006), &at_rest, jumping, 4);
     let found = fit_on(Some(&FLOOR), &views);
     assert!(found.is_none(), "{}", found.unwrap().way);
 }
 
 #[test]
-fn what_rests_and_is_cut_at_all_times_is_left_alone() {
+fn what_is_at_rest_and_cut_at_all_times_is_left_alone() {
     let beside: Cameras = |time| vec![camera(0.9 + 0.2 * time as f64 / TIMES as f64)];
     let right = DVec3::new(1.0_f64.cos(), 1.0_f64.sin(), 0.0);
-    let rests = vec![(DQuat::IDENTITY, 0.31 * right + 0.05 * DVec3::Z); TIMES];
-    let views = views(solid(&box_places(), patches, 0.006), &rests, beside);
+    let at_rest = vec![(DQuat::IDENTITY, 0.31 * right + 0.05 * DVec3::Z); TIMES];
+    let views = views(solid(&box_places(), patches, 0.006), &at_rest, beside);
     assert!(views.iter().all(|view| view.cut));
     let found = fit_on(Some(&FLOOR), &views);
     assert!(found.is_none(), "{:?}", found.map(|found| (found.way, found.error, found.unturned)));
@@ -164,7 +164,7 @@ fn what_comes_to_rest_as_soon_as_it_is_seen_is_followed_to_the_border() {
     assert!(errors.len() == 3 && errors.iter().all(|error| *error < 0.02), "{errors:?}");
 }
 
-/// Seen by one of several cameras, whose border cuts it, where it rests before it goes.
+/// Seen by one of several cameras, whose border cuts it, where it stands before it goes.
 #[test]
 fn what_one_camera_sees_a_part_of_is_found_where_it_is() {
     let place = |time: usize| DVec3::new((0.02 * (time as f64 - 8.0)).clamp(0.0, 0.24) - 0.1, 0.0, 0.045);
@@ -356,10 +356,10 @@ fn lifted_and_tilted() -> (Vec<ObjectView>, Vec<(DQuat, DVec3)>) {
 }
 
 #[test]
-fn supports_hold_objects_whose_distance_nothing_else_tells() {
+fn supports_hold_objects_whose_distance_nothing_else_shows() {
     let truth: Vec<(DQuat, DVec3)> =
         (0..TIMES).map(|k| (DQuat::IDENTITY, DVec3::new(0.1 - 0.006 * k as f64, 0.0, 0.045))).collect();
-    // Of every outline that it may have: rays of several cameras or sides tell it, and it is held.
+    // Of every outline that it may have: rays of several cameras or sides show it, and it is held.
     let held = |cameras: Cameras| -> Vec<(bool, bool)> {
         let views = views(solid(&sphere_places(0.045), patches, 0.006), &truth, cameras);
         with_objects(Some(&FLOOR), &views, |objects| {
@@ -386,7 +386,7 @@ fn what_is_lifted_and_tilted_is_followed_off_its_support() {
         let begun = objects[0].begun().unwrap().unwrap();
         let poses = begun.fit.poses.iter().map(|(time, pose)| (*time, (pose.rotation, pose.translation)));
         let (turn, shift) = errors(&poses.collect(), &truth);
-        assert!(begun.way.told().starts_with("followed"), "{}", begun.way.told());
+        assert!(begun.way.in_words().starts_with("followed"), "{}", begun.way.in_words());
         assert!(turn < 12.0 && shift < 0.02, "{turn} deg, {shift} m");
     });
 }
@@ -514,7 +514,7 @@ fn how_a_plain_ball_turns_in_the_air_is_assumed() {
 fn turns_at_times_that_hide_it_go_the_way_of_those_around_them() {
     let truth = rolling(0.057);
     let mut views = views(solid(&sphere_places(0.05), patches, 0.006), &truth, moving);
-    // The shortest turn across the gap is the other way round; between 3 and 5 the poses there tell.
+    // The shortest turn across the gap is the other way round; between 3 and 5 the poses there show it.
     views.retain(|view| view.time_index != 4 && !(8..22).contains(&view.time_index));
     with_objects(Some(&FLOOR), &views, |objects| {
         let pose = |time: usize| Pose { rotation: truth[time].0, translation: truth[time].1 };

@@ -22,7 +22,7 @@ const INSIDE: [f64; 2] = [0.85, 0.9];
 const FACING: f64 = 0.3;
 
 /// Places on either side whose mean brightness is taken away, which shading has too.
-const BESIDE: usize = 9;
+const NEIGHBOURS: usize = 9;
 
 /// Largest turn from one time to the next, degrees, and the difference of total turns, degrees, between those tried.
 const FASTEST: f64 = 40.0;
@@ -43,7 +43,7 @@ const ABOVE_RIVAL: f64 = 1.5;
 /// Root mean square of the texture, relative to its brightness, below which it may be noise.
 const FAINT: f64 = 0.02;
 
-/// Turns around what a constant rate tells that are tried at each time, places around, and rounds of that.
+/// Turns around what a constant rate gives that are tried at each time, places around, and rounds of that.
 const REFINED: (i64, usize) = (3, 3);
 
 /// Fewest times that are compared.
@@ -68,7 +68,7 @@ struct Cylinder {
 /// Views by time.
 type Views<'a> = BTreeMap<usize, Vec<&'a ObjectView>>;
 
-/// Rotations about `up` by time that explain how the texture goes around; `None` where it does not tell them. `path`
+/// Rotations about `up` by time that explain how the texture goes around; `None` where it does not show them. `path`
 /// is that of the centre.
 pub(super) fn turns<'a>(
     views: impl Iterator<Item = &'a ObjectView>,
@@ -77,7 +77,7 @@ pub(super) fn turns<'a>(
     up: DVec3,
 ) -> Option<BTreeMap<usize, DQuat>> {
     let at = by_time(views, |time| path.contains_key(&time))?;
-    // One camera shows too little of the surface at a time to tell a turn from a roll.
+    // One camera shows too little of the surface at a time to distinguish a turn from a roll.
     if at.values().any(|views| views.len() < 2) {
         return None;
     }
@@ -91,17 +91,17 @@ pub(super) fn turns<'a>(
     let (first, last) = (*at.keys().next()?, *at.keys().next_back()?);
     let shares: Vec<f64> = at.keys().map(|time| (time - first) as f64 / (last - first) as f64).collect();
     let surfaces = unrolled(&at, cylinder);
-    let found = told(&surfaces, &shares, FASTEST * (last - first) as f64)?;
+    let found = best_turns(&surfaces, &shares, FASTEST * (last - first) as f64)?;
     Some(at.keys().zip(found).map(|(time, turn)| (*time, DQuat::from_scaled_axis(turn * up))).collect())
 }
 
 /// Views by time, where there are enough.
 fn by_time<'a>(
     views: impl Iterator<Item = &'a ObjectView>,
-    is_wanted: impl Fn(usize) -> bool,
+    is_needed: impl Fn(usize) -> bool,
 ) -> Option<Views<'a>> {
     let mut at = Views::new();
-    for view in views.filter(|view| is_wanted(view.time_index)) {
+    for view in views.filter(|view| is_needed(view.time_index)) {
         at.entry(view.time_index).or_default().push(view);
     }
     (at.len() >= FEWEST).then_some(at)
@@ -116,8 +116,8 @@ fn unrolled(at: &Views<'_>, cylinder: impl Fn(&usize) -> Cylinder + Sync) -> Vec
 }
 
 /// Turns of surfaces, radians, by the total turn, at most `most` degrees either way, that explains them best when they turn
-/// by shares of it; `None` where the texture does not tell.
-fn told(surfaces: &[Surface], shares: &[f64], most: f64) -> Option<Vec<f64>> {
+/// by shares of it; `None` where the texture does not show them.
+fn best_turns(surfaces: &[Surface], shares: &[f64], most: f64) -> Option<Vec<f64>> {
     let places = |total: f64| -> Vec<f64> {
         shares.iter().map(|share| share * total / 360.0 * AROUND as f64).collect()
     };
@@ -130,10 +130,10 @@ fn told(surfaces: &[Surface], shares: &[f64], most: f64) -> Option<Vec<f64>> {
     let chance = sorted[sorted.len() / 2];
     let is_rival = |k: &usize| (totals[*k] - totals[best]).abs() > RIVAL;
     let rival = (0..totals.len()).filter(is_rival).map(|k| scores[k]).fold(0.0, f64::max);
-    let is_told = scores[best] > EXPLAINED.max(ABOVE_CHANCE * chance).max(ABOVE_RIVAL * rival);
+    let is_clear = scores[best] > EXPLAINED.max(ABOVE_CHANCE * chance).max(ABOVE_RIVAL * rival);
     let seen: f64 = surfaces.iter().flat_map(|surface| &surface.weights).sum();
     let strength = (scores[best] * surfaces.iter().map(power).sum::<f64>() / seen.max(1e-9)).sqrt();
-    if !is_told || strength < FAINT || totals[best].abs() < SMALLEST {
+    if !is_clear || strength < FAINT || totals[best].abs() < SMALLEST {
         return None;
     }
     let found = refined(surfaces, places(totals[best]));
@@ -143,12 +143,12 @@ fn told(surfaces: &[Surface], shares: &[f64], most: f64) -> Option<Vec<f64>> {
 /// The surface of a cylinder, as views of one time show it.
 fn unroll(views: &[&ObjectView], cylinder: &Cylinder) -> Surface {
     let Cylinder { centre, axis, across, radius, half_length } = *cylinder;
-    let beside = axis.cross(across);
+    let perpendicular = axis.cross(across);
     let mut surface = Surface { values: vec![0.0; AROUND * ALONG], weights: vec![0.0; AROUND * ALONG] };
     for place in 0..AROUND * ALONG {
         let angle = ((place / ALONG) as f64 + 0.5) / AROUND as f64 * TAU;
         let share = ((place % ALONG) as f64 + 0.5) / ALONG as f64 * 2.0 - 1.0;
-        let outward = angle.cos() * across + angle.sin() * beside;
+        let outward = angle.cos() * across + angle.sin() * perpendicular;
         let point = centre + INSIDE[0] * radius * outward + INSIDE[1] * share * half_length * axis;
         let mut sum = 0.0;
         for view in views {
@@ -196,7 +196,8 @@ fn take_light_away(surfaces: &mut [Surface]) {
     for surface in surfaces.iter_mut() {
         let smooth = |place: usize| {
             let (around, along) = (place / ALONG, place % ALONG);
-            let near = (0..=2 * BESIDE).map(|k| (around + AROUND + k - BESIDE) % AROUND * ALONG + along);
+            let near =
+                (0..=2 * NEIGHBOURS).map(|k| (around + AROUND + k - NEIGHBOURS) % AROUND * ALONG + along);
             let (sum, total) = near.fold((0.0, 0.0), |(sum, total), other| {
                 let weight = surface.weights[other];
                 (sum + weight * surface.values[other], total + weight)

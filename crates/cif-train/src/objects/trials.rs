@@ -39,7 +39,7 @@ pub(super) const REST_GAIN: [f64; 2] = [1.5, 1.15];
 /// Steps of poses of times that were left out.
 const SETTLE: usize = 40;
 
-/// Error of the smallest turn in place, relative to that of one whose angle the pictures do not tell, from which it turns
+/// Error of the smallest turn in place, relative to that of one whose angle the pictures do not show, from which it turns
 /// at all: what deforms is explained by any of them.
 const SPIN_GAIN: f64 = 1.12;
 
@@ -70,7 +70,7 @@ const MOST_IN_PLACE: f64 = 0.1;
 /// objects, and of round ones, which it turns so that shading stays on them.
 const FOLLOW_GAIN: [f64; 2] = [0.98, 0.85];
 
-/// Error of an object on its support where it moves, relative to that where it rests, from which it may be off it, and
+/// Error of an object on its support where it moves, relative to that where it is at rest, from which it may be off it, and
 /// the largest error of it off its support, relative to that on it, at which it is.
 const STRAINED: f64 = 1.15;
 const OFF_GAIN: f64 = 0.85;
@@ -88,11 +88,11 @@ const LIES: [f64; 2] = [0.8, 0.2];
 /// ones.
 const ROLL_GAIN: [f64; 2] = [0.97, 0.94];
 
-/// Error by which rivals must be told apart, relative: of most objects, and of round ones, whose shading prefers no
+/// Error by which rivals must be distinguished, relative: of most objects, and of round ones, whose shading prefers no
 /// turn; and the turn from which they are rivals, degrees.
 const RIVAL: ([f64; 2], i32) = ([1.02, 1.06], 60);
 
-/// Largest error of rolling, relative to that of sliding, at which it is assumed where no turn is told.
+/// Largest error of rolling, relative to that of sliding, at which it is assumed where no turn is known.
 const ROLLS_AS_WELL: f64 = 1.015;
 
 /// The same of sliding with a turn of [`RIVAL`] degrees or more, which few things do.
@@ -131,7 +131,7 @@ struct Contest<'a> {
 /// Trials of resting and of sliding without a turn, in numbers.
 struct Simple {
     /// Error of resting, on the views that were left out.
-    rests: Option<f64>,
+    at_rest: Option<f64>,
     /// Error of sliding without a turn, on the same views.
     slides: Option<f64>,
     /// True where resting explains about as much as sliding.
@@ -152,7 +152,7 @@ struct Chosen {
     is_shown: Option<bool>,
 }
 
-/// The best way of moving of an object that is seen well at enough times; `None` where it rests.
+/// The best way of moving of an object that is seen well at enough times; `None` where it is at rest.
 pub(super) fn best_way<'a>(
     object: Object<'a>,
     path: BTreeMap<usize, DVec3>,
@@ -169,13 +169,13 @@ pub(super) fn best_way<'a>(
     else {
         return Ok(None);
     };
-    if simple.rests.is_some_and(|rests| rests <= BENT_AWAY * error)
+    if simple.at_rest.is_some_and(|at_rest| at_rest <= BENT_AWAY * error)
         && let Some((fit, level)) = resting
         && bend::bent(&fit, &contest.views, level) <= BENDS_IN_PLACE * error
     {
         return Ok(None);
     }
-    let may_bend = !object.is_told && chosen.way != Way::Lies;
+    let may_bend = !object.is_declared && chosen.way != Way::Lies;
     let bent = (error > DOUBTED && may_bend).then(|| bend::gain(&fit, &contest.views, fit.trial_level()));
     if contest.deforms(chosen.way, error, bent, &simple) {
         return Ok(None);
@@ -228,9 +228,9 @@ impl<'a> Contest<'a> {
     /// The simple trials in numbers.
     fn judged_simple(&self, trials: &[Trial<'_>]) -> Simple {
         Simple {
-            rests: error_of(trials, Way::Rest),
+            at_rest: error_of(trials, Way::Rest),
             slides: error_of(trials, Way::Slide(0)),
-            stays: rests(trials, Way::Slide(0), REST_GAIN[0]),
+            stays: is_at_rest(trials, Way::Slide(0), REST_GAIN[0]),
             is_unexplained: self.is_unexplained(trials),
         }
     }
@@ -239,12 +239,12 @@ impl<'a> Contest<'a> {
     fn bendable(&self, trials: &[Trial<'a>], simple: &Simple) -> Option<(Fit<'a>, usize)> {
         let object = self.object;
         let may_deform =
-            !object.is_told && object.outline.roundness < 1.0 && (!simple.stays || simple.is_unexplained);
+            !object.is_declared && object.outline.roundness < 1.0 && (!simple.stays || simple.is_unexplained);
         let Trial { fit, .. } = trials.iter().find(|trial| may_deform && trial.way == Way::Rest)?;
         Some((object.fit(fit.poses.clone(), fit.shape.copied(), fit.rng.clone()), fit.trial_level()))
     }
 
-    /// Trials of the ways that may explain what the simple ones, which are given, do not; `None` where it rests.
+    /// Trials of the ways that may explain what the simple ones, which are given, do not; `None` where it is at rest.
     fn worthwhile(
         &mut self,
         trials: Vec<Trial<'a>>,
@@ -254,7 +254,7 @@ impl<'a> Contest<'a> {
         if let Some(textured) = self.textured(&trials, stays)? {
             return Ok(Some(vec![textured]));
         }
-        if self.object.is_told {
+        if self.object.is_declared {
             return self.along_the_path(trials).map(Some);
         }
         if stays && !is_unexplained {
@@ -265,9 +265,9 @@ impl<'a> Contest<'a> {
         moves.then(|| self.along_the_path(trials)).transpose()
     }
 
-    /// The motion that explains most of what trials were judged by; `None` where it rests.
+    /// The motion that explains most of what trials were judged by; `None` where it is at rest.
     fn chosen(&self, trials: &[Trial<'_>]) -> Option<Chosen> {
-        let Object { outline, is_told, .. } = self.object;
+        let Object { outline, is_declared, .. } = self.object;
         let followed = trials.iter().find(|trial| trial.way == Way::Followed);
         let shown = OnceCell::new();
         let is_shown = || {
@@ -276,8 +276,8 @@ impl<'a> Contest<'a> {
             })
         };
         let (way, rotation) = decide(&meant(errors(trials), outline, is_shown), outline)
-            .filter(|(way, _)| is_told || !rests(trials, *way, REST_GAIN[1]))?;
-        if rotation == RotationEvidence::Assumed && !is_told && !turns(|way| error_of(trials, way), way) {
+            .filter(|(way, _)| is_declared || !is_at_rest(trials, *way, REST_GAIN[1]))?;
+        if rotation == RotationEvidence::Assumed && !is_declared && !turns(|way| error_of(trials, way), way) {
             return None;
         }
         // The path of a ball whose turn does not show is best where none is looked for; its rolling is put on afterwards.
@@ -289,9 +289,9 @@ impl<'a> Contest<'a> {
 
     /// True where an object deforms, or opens: it stays in place, and looks otherwise in every turn.
     fn deforms(&self, way: Way, error: f64, bent: Option<f64>, simple: &Simple) -> bool {
-        let most = match simple.rests {
+        let most = match simple.at_rest {
             _ if matches!(way, Way::Spin(_)) => MOST_IN_PLACE,
-            Some(rests) if simple.stays && simple.is_unexplained => EXPLAINED * rests,
+            Some(at_rest) if simple.stays && simple.is_unexplained => EXPLAINED * at_rest,
             _ => f64::INFINITY,
         };
         // Of thin things the outline, which is never exact, is most of what is seen: they are solid where bending explains
@@ -299,7 +299,7 @@ impl<'a> Contest<'a> {
         let may_be_solid = !self.object.outline.is_surrounded
             && !matches!(way, Way::Spin(_))
             && bent.is_some_and(|bent| bent >= BENDS_NO_BETTER);
-        error > most && !self.object.is_told && !may_be_solid
+        error > most && !self.object.is_declared && !may_be_solid
     }
 
     /// Holds the turns of a fit to what is known of them.
@@ -392,10 +392,11 @@ impl<'a> Contest<'a> {
     }
 
     /// True where views of all sides show how it turns from time to time, or it is lifted from where it stood, so that
-    /// its path does not tell.
+    /// its path does not show it.
     fn may_be_followed(&self) -> bool {
         let outline = self.object.outline;
-        outline.is_surrounded || (!is_round(outline) && !self.object.rests(&self.paths.along).is_empty())
+        outline.is_surrounded
+            || (!is_round(outline) && !self.object.runs_at_rest(&self.paths.along).is_empty())
     }
 
     /// True where following may find what neither resting nor sliding explains.
@@ -405,7 +406,7 @@ impl<'a> Contest<'a> {
     }
 
     /// The object followed over known times: on its support where its path is, and off it if that explains more where
-    /// it does not rest, as of what is lifted and tilted, so that its size does not tell.
+    /// it is not at rest, as of what is lifted and tilted, so that its size does not show it.
     fn follow(&self, known: &[usize]) -> Result<Option<Fit<'a>>, TrainError> {
         let (object, along) = (self.object, &self.paths.along);
         let followed = |air: Option<Vec<usize>>| -> Result<Option<Fit<'a>>, TrainError> {
@@ -415,9 +416,9 @@ impl<'a> Contest<'a> {
             Ok(Some(fit))
         };
         let Some(mut on) = followed(None)? else { return Ok(None) };
-        let rests: Vec<usize> = object.rests(along).into_iter().flatten().collect();
+        let at_rest: Vec<usize> = object.runs_at_rest(along).into_iter().flatten().collect();
         let (resting, moving): (Vec<usize>, Vec<usize>) =
-            self.views.train.iter().partition(|view| rests.contains(&object.views[**view].time_index));
+            self.views.train.iter().partition(|view| at_rest.contains(&object.views[**view].time_index));
         if resting.is_empty() || !on.air.is_empty() || !on.is_held() {
             return Ok(Some(on));
         }
@@ -426,13 +427,13 @@ impl<'a> Contest<'a> {
         if error < STRAINED * on.mean_loss(&resting, level) {
             return Ok(Some(on));
         }
-        let moves = along.keys().copied().filter(|time| !rests.contains(time));
+        let moves = along.keys().copied().filter(|time| !at_rest.contains(time));
         let Some(mut off) = followed(Some(moves.collect()))? else { return Ok(Some(on)) };
         let gains = off.mean_loss(&moving, level) < OFF_GAIN * error;
         Ok(Some(if gains { off } else { on }))
     }
 
-    /// All other ways along the path, beside the simple ones.
+    /// All other ways along the path, in addition to the simple ones.
     fn along_the_path(&mut self, simple: Vec<Trial<'a>>) -> Result<Vec<Trial<'a>>, TrainError> {
         let mut trials = simple;
         if self.may_be_followed() {
@@ -460,7 +461,7 @@ impl<'a> Contest<'a> {
         self.finely(&rivals)
     }
 
-    /// Trials with all pixels and small Gaussians, where fine texture may tell.
+    /// Trials with all pixels and small Gaussians, where fine texture may decide.
     fn finely(&self, ways: &[Way]) -> Result<Vec<Trial<'a>>, TrainError> {
         let mut trials = self.begin(ways, FINE.0);
         let early = FINE.1 / 3;
@@ -512,7 +513,7 @@ impl<'a> Contest<'a> {
     }
 
     /// Moves the poses of times that were left out onto their views, the shape as it is: from one side to the next an
-    /// object turns more than its neighbours tell, and how it looks from there is what is judged.
+    /// object turns more than its neighbours imply, and how it looks from there is what is judged.
     fn settle(&self, fit: &mut Fit<'_>, level: usize) {
         let mut shape = fit.shape.copied();
         let is_between = |view: &&usize| self.between.contains(&self.object.views[**view].time_index);
@@ -573,7 +574,7 @@ fn error_of(trials: &[Trial<'_>], way: Way) -> Option<f64> {
     trials.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1])
 }
 
-/// True of ways whose pictures tell that it turns, if not how far: the smallest turn in place explains less.
+/// True of ways whose pictures show that it turns, if not how far: the smallest turn in place explains less.
 fn turns(error_of: impl Fn(Way) -> Option<f64>, way: Way) -> bool {
     let Way::Spin(degrees) = way else { return true };
     let smallest = Way::Spin(SMALLEST_SPIN * degrees.signum());
@@ -583,7 +584,7 @@ fn turns(error_of: impl Fn(Way) -> Option<f64>, way: Way) -> bool {
 }
 
 /// True where the error of resting is at most `gain` times that of a way of moving.
-fn rests(trials: &[Trial<'_>], way: Way, gain: f64) -> bool {
+fn is_at_rest(trials: &[Trial<'_>], way: Way, gain: f64) -> bool {
     error_of(trials, Way::Rest).zip(error_of(trials, way)).is_some_and(|(rest, moves)| rest <= gain * moves)
 }
 
@@ -602,11 +603,11 @@ fn meant(mut tried: Vec<(Way, f64)>, outline: &Outline, is_shown: impl FnOnce() 
     tried
 }
 
-/// The best way of moving, by the errors of those that were tried, and whether the pictures tell its turns.
+/// The best way of moving, by the errors of those that were tried, and whether the pictures show its turns.
 fn decide(tried: &[(Way, f64)], outline: &Outline) -> Option<(Way, RotationEvidence)> {
     let (is_round, in_contact) = (is_round(outline), outline.air.is_empty());
-    let best = |wanted: &dyn Fn(&Way) -> bool| {
-        tried.iter().filter(|(way, _)| wanted(way)).min_by(|a, b| a.1.total_cmp(&b.1)).copied()
+    let best = |fits: &dyn Fn(&Way) -> bool| {
+        tried.iter().filter(|(way, _)| fits(way)).min_by(|a, b| a.1.total_cmp(&b.1)).copied()
     };
     let (moving, moving_error) = best(&|way| *way != Way::Rest)?;
     let roll = best(&|way| matches!(way, Way::Roll(_)));
@@ -637,7 +638,7 @@ fn decide(tried: &[(Way, f64)], outline: &Outline) -> Option<(Way, RotationEvide
     let rival = best(&|way| way.degrees().is_some_and(apart));
     let same = if is_round { SAME } else { 0.0 };
     let least = (RIVAL.0[usize::from(is_round)] * turning_error).max(turning_error + same);
-    let has = |wanted: Way| tried.iter().any(|(way, _)| *way == wanted);
+    let has = |other: Way| tried.iter().any(|(way, _)| *way == other);
     // Where no turn of something round was tried, none is known.
     let is_untried = is_round && tried.iter().filter(|(way, _)| way.degrees().is_some()).count() < 2;
     if is_untried || rival.is_some_and(|(_, error)| error < least) {
@@ -663,7 +664,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn turns_that_nothing_tells_are_assumed() {
+    fn turns_that_nothing_shows_are_assumed() {
         let outline = |roundness: f64, air: Vec<usize>| Outline {
             air,
             ..shaped(0.05, 0.05, roundness, BTreeMap::new())

@@ -33,7 +33,7 @@ const WHOLE_TOUCHED: f64 = 0.1;
 const SLIVER: f64 = 0.1;
 
 /// Pixels of a mask that change, of its area, and mean change of its colours, in [0, 1], up to which nothing moved: of
-/// what rests in rendered captures colours change by up to 0.045, of what moves by 0.06 and more.
+/// what is at rest in rendered captures colours change by up to 0.045, of what moves by 0.06 and more.
 const SAME: (f64, f64) = (0.02, 0.05);
 
 /// Share of a whole mask in the disc around its middle from which it is that of a ball.
@@ -74,7 +74,7 @@ pub(super) struct Crop {
 /// The object in a frame.
 pub(super) struct ObjectView {
     pub(super) time_index: usize,
-    /// Number that tells cameras that stay in place apart.
+    /// Number that distinguishes cameras that stay in place.
     pub(super) camera_key: [i64; 3],
     pub(super) camera: PinholeCamera,
     /// Pixels of the mask: columns and rows.
@@ -182,12 +182,12 @@ impl ObjectView {
         !self.cut && self.visible > 0.5
     }
 
-    /// True where the mask tells where the object is: enough of it is seen, or the border alone hides the rest.
-    pub(super) fn tells_place(&self) -> bool {
+    /// True where the mask shows where the object is: enough of it is seen, or the border alone hides the rest.
+    pub(super) fn shows_place(&self) -> bool {
         !self.is_sliver() || (self.cut && self.touched < WHOLE_TOUCHED)
     }
 
-    /// True of a mask that shows too little of what others hide, or the border cuts, to tell how the object is turned.
+    /// True of a mask that shows too little of what others hide, or the border cuts, to show how the object is turned.
     pub(super) fn is_sliver(&self) -> bool {
         self.visible < SLIVER
     }
@@ -259,7 +259,7 @@ pub(super) fn look_alike(views: &[ObjectView], a: usize, b: usize) -> bool {
 }
 
 /// True where all cameras see the same at a time as at that before or after it at which any sees it.
-pub(super) fn rests(views: &[ObjectView], time: usize) -> bool {
+pub(super) fn is_at_rest(views: &[ObjectView], time: usize) -> bool {
     let before = views.iter().map(|view| view.time_index).filter(|other| *other < time).max();
     let after = views.iter().map(|view| view.time_index).filter(|other| *other > time).min();
     [before, after].into_iter().flatten().any(|other| look_alike(views, time, other))

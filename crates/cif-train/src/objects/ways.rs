@@ -20,7 +20,7 @@ pub(super) const SMALLEST_SPIN: i32 = 40;
 /// Rolling radii tried of balls, of the height.
 const ROLLS: [f64; 9] = [0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08];
 
-/// Rolling radii tried of other things, whose height tells it less well.
+/// Rolling radii tried of other things, whose height gives it less well.
 const OTHER_ROLLS: [f64; 12] = [0.64, 0.68, 0.72, 0.76, 0.8, 0.84, 0.88, 0.92, 0.96, 1.0, 1.04, 1.08];
 
 /// Roundness of masks from which an object may roll as a ball.
@@ -57,7 +57,7 @@ pub(super) enum Way {
 
 impl Way {
     /// The way in words.
-    pub(super) fn told(self) -> String {
+    pub(super) fn in_words(self) -> String {
         match self {
             Self::Rest => "rests".to_owned(),
             Self::Slide(degrees) => format!("slides, turning {degrees} deg"),
@@ -69,7 +69,7 @@ impl Way {
         }
     }
 
-    /// Turn about the normal, degrees, of ways that are told apart by it.
+    /// Turn about the normal, degrees, of ways that are distinguished by it.
     pub(super) fn degrees(self) -> Option<i32> {
         match self {
             Self::Slide(degrees) | Self::Spin(degrees) => Some(degrees),
@@ -129,7 +129,7 @@ impl Paths<'_> {
         self.up.cross(*last - *first).try_normalize()
     }
 
-    /// Ways of moving along the path worth a trial, beside sliding without a turn.
+    /// Ways of moving along the path worth a trial, in addition to sliding without a turn.
     pub(super) fn ways(&self) -> Vec<Way> {
         let mut ways = Vec::new();
         ways.extend(turns().map(Way::Slide));

@@ -12,7 +12,7 @@ use crate::working_size;
 /// Share of changed pixels up to which a fixed camera sees nothing move.
 const STATIC_CHANGE: f64 = 5e-4;
 
-/// Angle between views up to which colour cannot be told to depend on the view, degrees.
+/// Angle between views up to which colour cannot be shown to depend on the view, degrees.
 const FEW_DIRECTIONS: f64 = 4.0;
 
 /// Ratio of footprints from which the low-pass filter of the nearest views would hide detail, or that of the
@@ -126,7 +126,7 @@ impl Plan<'_> {
         effect
     }
 
-    /// Nothing where the preset has no outputs beside the centres.
+    /// Nothing where the preset has no outputs other than the centres.
     fn shape(&self) -> Option<Effect> {
         let heads = self.config.model.heads;
         let optional: Vec<&str> = [
@@ -395,23 +395,23 @@ fn motion(found: &Evidence) -> (bool, String) {
 
 /// The motion that is tried for every instance, and why: training decides between poses and the network.
 pub(super) fn objects(found: &Evidence, config: &TrainConfig) -> (String, String) {
-    let told = &config.motion.of;
-    let untold: Vec<&str> =
-        found.travelling.iter().map(String::as_str).filter(|label| !told.contains_key(*label)).collect();
+    let declared = &config.motion.of;
+    let undeclared: Vec<&str> =
+        found.travelling.iter().map(String::as_str).filter(|label| !declared.contains_key(*label)).collect();
     let mut words = Vec::new();
-    if !untold.is_empty() {
-        words.push(format!("rigid, if pixels left out agree, else free: {}", untold.join(", ")));
+    if !undeclared.is_empty() {
+        words.push(format!("rigid, if pixels left out agree, else free: {}", undeclared.join(", ")));
     }
-    // What is told is not judged.
+    // What is declared is not judged.
     for (name, motion) in [("rigid", ObjectMotion::Rigid), ("free", ObjectMotion::Free)] {
-        let labels: Vec<String> = (told.iter().filter(|(_, told)| **told == motion))
+        let labels: Vec<String> = (declared.iter().filter(|(_, declared)| **declared == motion))
             .map(|(label, _)| format!("{label} (told)"))
             .collect();
         if !labels.is_empty() {
             words.push(format!("{name}: {}", labels.join(", ")));
         }
     }
-    let rest = found.instances.saturating_sub(untold.len() + told.len());
+    let rest = found.instances.saturating_sub(undeclared.len() + declared.len());
     let joints = if config.motion.parts { ", unless a joint or a turn in place is found" } else { "" };
     if rest > 0 {
         words.push(format!("static: the other {rest}{joints}"));

@@ -7,7 +7,7 @@ use serde::ser::{Serialize, Serializer};
 pub enum EffectKind {
     /// The deformation network.
     Motion,
-    /// Its outputs beside the centres: scales, rotations, opacities, colours.
+    /// Its outputs other than the centres: scales, rotations, opacities, colours.
     Shape,
     /// Nodes of the time planes.
     TimePlanes,

@@ -102,7 +102,7 @@ impl Evidence {
         let looked = if dataset.times.len() > 1 { masked.len().min(MASKS) } else { 0 };
         let _phase = phases.enter(Phase::Plan, looked);
         let change = if is_compared { Some(largest_change(dataset, &fixed, phases)?) } else { None };
-        let sightings = sightings(dataset, &masked, phases)?;
+        let shown = observations(dataset, &masked, phases)?;
         Ok(Self {
             times: dataset.times.len(),
             frames: training.len(),
@@ -111,8 +111,8 @@ impl Evidence {
             change,
             masked: masked.len(),
             instances: dataset.instances.len(),
-            travelling: labels(dataset, |id| travels(&sightings.of(id))),
-            appearing: labels(dataset, |id| sightings.appears(id) || sightings.vanishes(id)),
+            travelling: labels(dataset, |id| travels(&shown.of(id))),
+            appearing: labels(dataset, |id| shown.appears(id) || shown.vanishes(id)),
             exposures: exposures(dataset, &cameras, phases)?,
             footprint_ratio: footprint_ratio(dataset, &training),
             view_angle: view_angle(dataset, &training),
@@ -160,7 +160,7 @@ fn largest_change(
 }
 
 /// Where masks show instances, in a sample of the frames; nothing for a single time.
-fn sightings<'a>(
+fn observations<'a>(
     dataset: &Dataset,
     masked: &[(usize, &'a Frame)],
     phases: &Phases,
@@ -205,8 +205,8 @@ fn sightings<'a>(
 }
 
 /// Labels of the instances of which something is true, by their ids.
-fn labels(dataset: &Dataset, wanted: impl Fn(u16) -> bool) -> Vec<String> {
-    let instances = dataset.instances.iter().filter(|instance| wanted(instance.id));
+fn labels(dataset: &Dataset, holds: impl Fn(u16) -> bool) -> Vec<String> {
+    let instances = dataset.instances.iter().filter(|instance| holds(instance.id));
     instances.map(|instance| instance.label.clone()).collect()
 }
 
@@ -222,14 +222,14 @@ fn exposures(
     }
     let (mut of_cameras, mut drift) = (Vec::new(), None::<f64>);
     for frames in spread(&cameras.values().collect::<Vec<_>>(), EXPOSED_CAMERAS) {
-        let wanted = if cameras.len() > 1 { EXPOSED_IMAGES } else { EXPOSED_IMAGES_OF_ONE };
+        let most = if cameras.len() > 1 { EXPOSED_IMAGES } else { EXPOSED_IMAGES_OF_ONE };
         let mut recorded = Recorded::of(&points);
-        for (index, frame) in spread(frames, wanted) {
+        for (index, frame) in spread(frames, most) {
             phases.check()?;
             recorded.add(&dataset.load_image(index, [1.0; 3])?, &frame.camera);
         }
-        of_cameras.extend(recorded.beside_colors());
-        // Photographs of one moment have exposures of their own too, but nothing tells those of others.
+        of_cameras.extend(recorded.relative_to_colors());
+        // Photographs of one moment have exposures of their own too, but nothing shows those of others.
         let mut times: Vec<usize> = frames.iter().map(|(_, frame)| frame.time_index).collect();
         times.sort_unstable();
         times.dedup();

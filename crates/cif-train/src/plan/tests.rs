@@ -140,22 +140,22 @@ fn every_effect_says_why_and_what_decides_otherwise() {
 }
 
 #[test]
-fn the_motion_that_is_tried_is_told_object_by_object() {
+fn the_motion_that_is_tried_is_listed_object_by_object() {
     let found = Evidence { travelling: vec!["ball".to_owned(), "scarf".to_owned()], ..found() };
-    let mut told = TrainConfig::default();
-    told.motion.of.insert("scarf".to_owned(), ObjectMotion::Free);
-    let plan = of(decide(&found, &told, &"auto".parse().unwrap()));
+    let mut declared = TrainConfig::default();
+    declared.motion.of.insert("scarf".to_owned(), ObjectMotion::Free);
+    let plan = of(decide(&found, &declared, &"auto".parse().unwrap()));
     let Some(Decision::Value(words)) = plan.decision(EffectKind::Objects) else { panic!("{plan:?}") };
     assert!(
         words.starts_with("rigid, if pixels left out agree, else free: ball; free: scarf (told);"),
         "{words}"
     );
     assert!(words.contains("static: the other 3, unless a joint"), "{words}");
-    plan.apply(&mut told);
-    assert!(told.motion.rigid && told.motion.parts);
-    // What is told is not judged.
-    told.motion.of.insert("ball".to_owned(), ObjectMotion::Rigid);
-    let (words, _) = objects(&found, &told);
+    plan.apply(&mut declared);
+    assert!(declared.motion.rigid && declared.motion.parts);
+    // What is declared is not judged.
+    declared.motion.of.insert("ball".to_owned(), ObjectMotion::Rigid);
+    let (words, _) = objects(&found, &declared);
     assert!(words.starts_with("rigid: ball (told); free: scarf (told); static: the other 3"), "{words}");
     let (plan, config) = self::plan(&found, "auto,-objects");
     assert_eq!(plan.decision(EffectKind::Objects), Some(&Decision::Off));

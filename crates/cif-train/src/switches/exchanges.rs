@@ -1,11 +1,11 @@
-//! Exchanges told by places: from one frame of a camera to the next, the mask of one object is where that of another
+//! Exchanges found by places: from one frame of a camera to the next, the mask of one object is where that of another
 //! was, and the other way round. No two objects change places between two frames; trackers exchange them, and most
 //! put it right a few frames later.
 
 use std::collections::BTreeMap;
 
 use super::masks::{Now, Sequence};
-use super::usual::{Usual, usual};
+use super::usual::{TypicalColors, typical_colors};
 
 /// Overlap of the mask of one object with that of another in the frame before from which they may be exchanged, and
 /// below which a mask is not where it was.
@@ -18,9 +18,9 @@ const MOST: f64 = 0.4;
 /// By how much less like their objects masks may become when they are put back.
 const WORSE: f64 = 0.05;
 
-/// Puts back what is exchanged in less than half of the frames of a camera, unless colours tell otherwise.
+/// Puts back what is exchanged in less than half of the frames of a camera, unless colours show otherwise.
 pub(super) fn put_back(sequences: &[Sequence], frames: &mut [Now<'_>]) {
-    let usual = usual(frames);
+    let typical = typical_colors(frames);
     for sequence in sequences {
         for ([a, b], cuts) in cuts(sequence, frames) {
             let exchanged = shorter(&cuts, sequence.len());
@@ -29,7 +29,7 @@ pub(super) fn put_back(sequences: &[Sequence], frames: &mut [Now<'_>]) {
             }
             let exchanged: Vec<usize> = exchanged.into_iter().map(|at| sequence.frames[at]).collect();
             let gains: Vec<f64> =
-                exchanged.iter().filter_map(|frame| gain(&frames[*frame], [a, b], &usual)).collect();
+                exchanged.iter().filter_map(|frame| gain(&frames[*frame], [a, b], &typical)).collect();
             if gains.iter().sum::<f64>() < -WORSE * gains.len() as f64 {
                 continue;
             }
@@ -77,9 +77,9 @@ fn shorter(cuts: &[usize], length: usize) -> Vec<usize> {
 
 /// By how much two masks of a frame become more like their objects when they are exchanged; `None` where they are not
 /// both there, or the colours of the objects are not known.
-fn gain(now: &Now<'_>, [a, b]: [u16; 2], usual: &BTreeMap<u16, Usual>) -> Option<f64> {
+fn gain(now: &Now<'_>, [a, b]: [u16; 2], typical: &BTreeMap<u16, TypicalColors>) -> Option<f64> {
     let masks = [now.get(&a)?, now.get(&b)?];
-    let objects = [usual.get(&a)?, usual.get(&b)?];
+    let objects = [typical.get(&a)?, typical.get(&b)?];
     let exchanged = objects[0].likeness(masks[1]) + objects[1].likeness(masks[0]);
     Some(exchanged - objects[0].likeness(masks[0]) - objects[1].likeness(masks[1]))
 }

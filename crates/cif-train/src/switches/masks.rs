@@ -11,7 +11,7 @@ use super::place::{Place, places};
 /// Pixels below which a mask is too small to be looked at.
 const FEWEST: usize = 8;
 
-/// Captured times between two frames of which one tells of the other.
+/// Captured times between two frames of which one says something of the other.
 const NEAR: usize = 3;
 
 /// A mask of one frame.

@@ -1,7 +1,7 @@
 //! Masks of one object that show another, as trackers leave them when they lose an object and take up another: found
 //! by the colours inside and by the places where they are, and put right.
 //!
-//! Every object has a usual distribution of colours, that of most of its masks, and hardly moves from one frame of a
+//! Every object has a typical distribution of colours, that of most of its masks, and hardly moves from one frame of a
 //! camera to the next. Two masks that change places and soon change back are exchanged (see [`exchanges`]), and so are
 //! two that have each the colours of the other. A mask that has the colours of another object alone, or neither the
 //! colours of its own nor its place (see [`strays`]), is taken away, for nobody knows where the object is.
@@ -20,7 +20,7 @@ use cif_render::UNLABELLED;
 
 pub(crate) use masks::Seen;
 use masks::{Mask, Now, Sequence};
-use usual::{FEWEST_PIXELS, MOST, UNUSUAL, usual};
+use usual::{FEWEST_PIXELS, MOST, UNUSUAL, typical_colors};
 
 /// Likeness to another object from which a mask may show it, and by how much this exceeds the likeness to its own.
 const LIKE: f64 = 0.93;
@@ -47,13 +47,13 @@ pub(crate) fn switches(frames: &[Seen]) -> Vec<BTreeMap<u16, u16>> {
 
 /// Exchanges masks with the colours of each other, and takes away those with the colours of another object alone.
 fn follow_colors(frames: &mut [Now<'_>]) {
-    let usual = usual(frames);
+    let typical = typical_colors(frames);
     let shown = |label: &u16, mask: &Mask| {
-        let object = usual.get(label).filter(|_| mask.pixels >= FEWEST_PIXELS)?;
+        let object = typical.get(label).filter(|_| mask.pixels >= FEWEST_PIXELS)?;
         if object.unlike(mask) <= UNUSUAL {
             return None;
         }
-        let others = usual.iter().filter(|(other, _)| *other != label);
+        let others = typical.iter().filter(|(other, _)| *other != label);
         let best = others.map(|(other, object)| (*other, object.likeness(mask)));
         let (other, like) = best.max_by(|a, b| a.1.total_cmp(&b.1))?;
         (like >= LIKE && like >= object.likeness(mask) + MORE).then_some(other)

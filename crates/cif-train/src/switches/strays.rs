@@ -1,17 +1,17 @@
-//! Masks that show something else than their object for a moment: told by colours that are not those of the object,
+//! Masks that show something else than their object for a moment: recognised by colours that are not those of the object,
 //! at a place or of a size that the frames before and after do not bear out.
 
 use std::collections::BTreeMap;
 
 use super::masks::{Mask, Now, Sequence};
-use super::usual::{FEWEST_PIXELS, MOST, UNUSUAL, Usual, usual};
+use super::usual::{FEWEST_PIXELS, MOST, TypicalColors, UNUSUAL, typical_colors};
 
-/// By how much less than usual the colours of a mask are those of its object: where nothing is at its place in the
-/// frames before and after, and where these tell nothing, because the object or the camera is too fast.
+/// By how much less than is typical the colours of a mask are those of its object: where nothing is at its place in the
+/// frames before and after, and where these show nothing, because the object or the camera is too fast.
 const FOREIGN: f64 = 0.2;
 const FOREIGN_ANYWHERE: f64 = 0.6;
 
-/// Overlap of the masks of an object from frame to frame, in the middle, from which places tell something.
+/// Overlap of the masks of an object from frame to frame, in the middle, from which places are evidence.
 const STEADY: f64 = 0.3;
 
 /// Overlap below which nothing is at the place of a mask.
@@ -26,19 +26,19 @@ const SMALLER: f64 = 0.6;
 
 /// Takes stray masks away.
 pub(super) fn take_away(sequences: &[Sequence], frames: &mut [Now<'_>]) {
-    let usual = usual(frames);
+    let typical = typical_colors(frames);
     let mut found: BTreeMap<u16, Vec<usize>> = BTreeMap::new();
     for sequence in sequences {
         let steady = steady(sequence, frames);
         for at in 0..sequence.len() {
             for (label, mask) in &frames[sequence.frames[at]] {
-                let (Some(usual), Some(steady)) = (usual.get(label), steady.get(label)) else { continue };
+                let (Some(typical), Some(steady)) = (typical.get(label), steady.get(label)) else { continue };
                 let near: Vec<&Mask> = sequence
                     .near(at)
                     .into_iter()
                     .filter_map(|at| frames[sequence.frames[at]].get(label).copied())
                     .collect();
-                if strays(mask, usual, *steady, &near) {
+                if strays(mask, typical, *steady, &near) {
                     found.entry(*label).or_default().push(sequence.frames[at]);
                 }
             }
@@ -55,8 +55,8 @@ pub(super) fn take_away(sequences: &[Sequence], frames: &mut [Now<'_>]) {
 }
 
 /// True where a mask is not that of its object, given the masks before and after, where there are any.
-fn strays(mask: &Mask, usual: &Usual, steady: f64, near: &[&Mask]) -> bool {
-    let unlike = usual.unlike(mask);
+fn strays(mask: &Mask, typical: &TypicalColors, steady: f64, near: &[&Mask]) -> bool {
+    let unlike = typical.unlike(mask);
     let overlap = |other: &Mask| mask.place.overlap(&other.place);
     if steady < STEADY {
         return unlike > FOREIGN_ANYWHERE && mask.pixels >= FEWEST_PIXELS;

@@ -26,7 +26,7 @@ fn frame(time: usize, things: &[([u8; 3], Rectangle)], masks: &[(u16, Rectangle)
     Seen::of(&paint(GREY, things), Some(&paint(0, masks)), "camera", time)
 }
 
-/// A red thing (1), a green one (2) and a striped one (3) in shadow and light; `shown` tells which a mask shows.
+/// A red thing (1), a green one (2) and a striped one (3) in shadow and light; `shown` selects which a mask shows.
 fn frames(count: usize, shown: impl Fn(usize, u16) -> Option<u16>) -> Vec<Seen> {
     let frame = |k: usize| {
         let label_at = |at: u32| (at % 30 / 10) as u16 + 1;
@@ -120,7 +120,7 @@ fn colors_overrule_places() {
     assert!(found.iter().all(BTreeMap::is_empty), "{found:?}");
 }
 
-/// A red thing (1) that rests beside a blue one (2), whose mask is another one in one of 20 frames.
+/// A red thing (1) that stands beside a blue one (2), whose mask is another one in one of 20 frames.
 fn resting(at: usize, mask: Rectangle) -> Vec<Seen> {
     let (red, blue) = ([10, 5, 8, 8], [18, 5, 20, 8]);
     let frame = |k: usize| {
@@ -149,7 +149,7 @@ fn masks_without_the_place_and_the_colors_of_their_object_are_taken_away() {
         frame(k, &[(color, [10, 5, 8, 8])], &[(1, [10, 5, 8, 8])])
     };
     assert!(taken(&(0..20).map(shadow).collect::<Vec<_>>()).is_empty());
-    // Where the camera jumps, only colours tell.
+    // Where the camera jumps, only colours help.
     let jumps = |k: usize| {
         let left = if k.is_multiple_of(2) { 5 } else { 40 };
         let mask = if k == 7 { [20, 10, 8, 8] } else { [left, 5, 8, 8] };

@@ -1,4 +1,4 @@
-//! Colours that are usual for an object: those of most of its masks.
+//! Colours that are typical of an object: those of most of its masks.
 
 use std::collections::BTreeMap;
 
@@ -9,20 +9,20 @@ use super::masks::{Mask, Now};
 pub(super) const FEWEST_PIXELS: usize = 30;
 const FEWEST_MASKS: usize = 8;
 
-/// Rounds in which masks that are unlike the others are left out of what is usual, and how unlike.
+/// Rounds in which masks that are unlike the others are left out of what is typical, and how unlike.
 const ROUNDS: usize = 3;
 pub(super) const UNUSUAL: f64 = 0.1;
 
-/// Largest share of the masks of an object that may be switched, or stray; beyond, nobody knows what is usual.
+/// Largest share of the masks of an object that may be switched, or stray; beyond, nobody knows what is typical.
 pub(super) const MOST: f64 = 0.4;
 
-/// Usual colours of an object, and the usual likeness of its masks to them.
-pub(super) struct Usual {
+/// Typical colours of an object, and the median likeness of its masks to them.
+pub(super) struct TypicalColors {
     colors: Colors,
     middle: f64,
 }
 
-impl Usual {
+impl TypicalColors {
     fn of(masks: &[&Colors]) -> Self {
         let mut colors = Colors::mean(masks.iter().copied());
         let mut middle = 1.0;
@@ -48,8 +48,8 @@ impl Usual {
     }
 }
 
-/// Usual colours of the objects with enough masks of enough pixels, by label.
-pub(super) fn usual(frames: &[Now<'_>]) -> BTreeMap<u16, Usual> {
+/// Typical colours of the objects with enough masks of enough pixels, by label.
+pub(super) fn typical_colors(frames: &[Now<'_>]) -> BTreeMap<u16, TypicalColors> {
     let mut masks: BTreeMap<u16, Vec<&Colors>> = BTreeMap::new();
     for (label, mask) in frames.iter().flatten() {
         if mask.pixels >= FEWEST_PIXELS {
@@ -57,5 +57,5 @@ pub(super) fn usual(frames: &[Now<'_>]) -> BTreeMap<u16, Usual> {
         }
     }
     masks.retain(|_, masks| masks.len() >= FEWEST_MASKS);
-    masks.iter().map(|(label, masks)| (*label, Usual::of(masks))).collect()
+    masks.iter().map(|(label, masks)| (*label, TypicalColors::of(masks))).collect()
 }

@@ -12,18 +12,18 @@ use super::{FEWEST, Observation};
 const FEWEST_INSTANCES: usize = 2;
 /// Largest share of the frames that can be wrong; beyond, nobody knows which are right.
 const MOST: f64 = 0.25;
-/// Smallest miss that counts as usual, in radii of the mask, and in pixels.
-const USUAL_RADII: f64 = 0.1;
-const USUAL_PX: f64 = 1.0;
+/// Smallest miss that counts as typical, in radii of the mask, and in pixels.
+const TYPICAL_RADII: f64 = 0.1;
+const TYPICAL_PX: f64 = 1.0;
 /// Rounds of reweighting.
 const ROUNDS: usize = 24;
 
 /// Indices of the frames whose masks contradict the others, ascending. `frames` hold what [`super::observe`]
 /// found in each.
 ///
-/// Every instance has a point that most of its masks are seen around, and a usual angle by which they miss it:
+/// Every instance has a point that most of its masks are seen around, and a median angle by which they miss it:
 /// next to none for what stands still, more for what moves. A frame contradicts when more than half of its
-/// instances, two or more, miss by over `limit` times what is usual for them and by more than their own size.
+/// instances, two or more, miss by over `limit` times their median miss and by more than their own size.
 /// None do when that is so of more than a quarter of all frames.
 #[must_use]
 pub fn misfits(frames: &[BTreeMap<u16, Observation>], limit: f64) -> Vec<usize> {
@@ -40,12 +40,12 @@ pub fn misfits(frames: &[BTreeMap<u16, Observation>], limit: f64) -> Vec<usize> 
         let misses: Vec<f64> = observations.iter().map(|o| miss(o, point)).collect();
         let mut sorted = misses.clone();
         sorted.sort_by(f64::total_cmp);
-        let usual = sorted[sorted.len() / 2];
+        let median = sorted[sorted.len() / 2];
         for ((frame, o), miss) in seen.iter().zip(misses) {
             let focal = o.camera.focal_px.min_element();
             let radius = o.radius_px() / focal;
-            let usual = usual.max(USUAL_RADII * radius).max(USUAL_PX / focal);
-            excesses[*frame].push(if miss > radius { miss / usual } else { 0.0 });
+            let typical = median.max(TYPICAL_RADII * radius).max(TYPICAL_PX / focal);
+            excesses[*frame].push(if miss > radius { miss / typical } else { 0.0 });
         }
     }
     let contradicts = |excesses: &mut Vec<f64>| {
@@ -102,14 +102,14 @@ mod tests {
         let places = [[0.3, 0.2, 0.05], [-0.4, 0.1, 0.1], [0.0, -0.3, 0.2], [0.2, 0.5, 0.0]];
         (0..40)
             .map(|k| {
-                let (is, told) = turn(k);
+                let (is, stated) = turn(k);
                 let travelling = DVec3::new(0.5 - 0.02 * k as f64, 0.3, 0.06);
                 let centres = places.map(DVec3::from).into_iter().chain([travelling]);
                 let observation = |centre: DVec3| {
                     let (centroid_px, _) = camera(is).project(centre).unwrap();
                     Observation {
                         time_index: k,
-                        camera: camera(told),
+                        camera: camera(stated),
                         centroid_px,
                         area_px: 300.0,
                         cut: false,

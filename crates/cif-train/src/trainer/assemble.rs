@@ -92,8 +92,8 @@ fn put_masks_right(
     phases: &Phases,
 ) -> Result<Vec<TrainEvent>, TrainError> {
     let mut messages = Vec::new();
-    let finds_misfits = motion.misfit > 0.0;
-    let reads = finds_misfits || motion.switches;
+    let finds_outliers = motion.misfit > 0.0;
+    let reads = finds_outliers || motion.switches;
     if !reads && !motion.edges {
         return Ok(messages);
     }
@@ -103,8 +103,8 @@ fn put_masks_right(
     if reads {
         read = frames.read_masks(dataset, motion.switches, phases)?;
     }
-    if finds_misfits {
-        let left_out = frames.leave_out_misfits(dataset, &mut read, f64::from(motion.misfit));
+    if finds_outliers {
+        let left_out = frames.leave_out_outliers(dataset, &mut read, f64::from(motion.misfit));
         messages.extend(misfit_warning(dataset, &left_out));
     }
     if motion.switches {
@@ -154,7 +154,7 @@ impl Trainer {
         let start = Start { dataset, phases: phases.clone() };
         let mut trainer = Self::assemble(start, measured_frames, config, field, None)?;
         trainer.warn_of_capture();
-        trainer.check_told()?;
+        trainer.check_declared()?;
         let first = trainer.stages.from(&trainer.state.config, Stage::Search);
         trainer.state.progress = Progress::at(first);
         trainer.state.progress.exposures = trainer.exposures()?;
@@ -265,7 +265,7 @@ impl Trainer {
                 let frame = &dataset.frames[frames.index(view)];
                 let mut recorded = Recorded::of(&points);
                 recorded.add(&frames.get(dataset, view)?.image, &frame.camera);
-                if let Some(gains) = recorded.beside_colors() {
+                if let Some(gains) = recorded.relative_to_colors() {
                     exposures.begin_with(&frame.camera_name, frame.time, gains);
                 }
             }
@@ -276,7 +276,7 @@ impl Trainer {
 
     pub(super) fn warn_of_capture(&mut self) {
         if !self.stages.has_instances {
-            let (why, is_wanted) = if !self.state.config.effects.instances {
+            let (why, is_intended) = if !self.state.config.effects.instances {
                 ("instances are switched off", true)
             } else if self.state.dataset.instances.is_empty() {
                 ("the capture has no masks", true)
@@ -284,7 +284,7 @@ impl Trainer {
                 ("no training mask has a labelled pixel", false)
             };
             let message = format!("{why}: colour only, without identity and instance stages");
-            let message = if is_wanted { TrainEvent::note(message) } else { TrainEvent::warning(message) };
+            let message = if is_intended { TrainEvent::note(message) } else { TrainEvent::warning(message) };
             self.messages.push(message);
         }
         if !self.stages.is_dynamic {

@@ -1,4 +1,4 @@
-//! The engine of a run: the processor unless a GPU is given, or the faster of both, told by steps of the run that are
+//! The engine of a run: the processor unless a GPU is given, or the faster of both, determined by steps of the run that are
 //! tried on both for about a second, and undone.
 
 use std::time::Duration;
@@ -26,7 +26,7 @@ impl Trainer {
         Renderer::new(self.simd).simd_name()
     }
 
-    /// Name of the vector instructions that runs take unless told otherwise.
+    /// Name of the vector instructions that runs take unless set otherwise.
     #[must_use]
     pub fn vector_instructions() -> String {
         Renderer::new(SimdLevel::Auto).simd_name()

@@ -34,7 +34,7 @@ impl Span {
 }
 
 /// The pose at a time before the first of ascending poses, or after the last: motion goes on at the mean speed that it has
-/// beside them over as long a time, or over all of them where they last less, and then for no longer. `None` without two
+/// next to them over as long a time, or over all of them where they last less, and then for no longer. `None` without two
 /// poses.
 fn continued(poses: &[TrackPose], time: f64, reach: f64) -> Option<TrackPose> {
     let inwards: Vec<&TrackPose> =
@@ -186,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn what_rests_stays_to_the_bit() {
+    fn what_is_at_rest_stays_to_the_bit() {
         let mut group = moving(&[0.2, 0.3, 0.4]);
         for pose in &mut group.poses {
             (pose.translation, pose.rotation) = (DVec3::splat(0.7), DQuat::IDENTITY);

@@ -1,4 +1,4 @@
-//! Gaussians that the masks of their own instance contradict: they show up beside it in most of the views that see them.
+//! Gaussians that the masks of their own instance contradict: they show up outside it in most of the views that see them.
 //!
 //! Where each image has a time of its own, Gaussians close before one camera explain its image alone. They are labelled
 //! as the mask behind them is, and would make their object as large as the way to the camera.
@@ -24,19 +24,19 @@ const LIMIT: f32 = 1e-3;
 /// Coverage of a pixel from which what is seen there hides what lies behind it.
 const SOLID: f32 = 0.5;
 
-/// Distance from a mask, pixels, within which a centre does not lie beside it: outlines are known to a pixel.
+/// Distance from a mask, pixels, within which a centre does not lie outside it: outlines are known to a pixel.
 const OUTLINE: u32 = 1;
 
-/// Views that see a Gaussian inside and beside the mask of its instance.
+/// Views that see a Gaussian inside and outside the mask of its instance.
 #[derive(Clone, Copy, Debug, Default)]
 struct Votes {
     inside: u32,
-    beside: u32,
+    outside: u32,
 }
 
 impl Votes {
     fn contradict(self) -> bool {
-        self.beside > self.inside
+        self.outside > self.inside
     }
 }
 
@@ -62,7 +62,7 @@ impl Trainer {
             let (mut contradicted, others): (Vec<usize>, Vec<usize>) =
                 members.into_iter().partition(|row| votes[*row].contradict());
             // Those that most views bear out come first, and stay where there are too few others.
-            let margin = |row: &usize| i64::from(votes[*row].inside) - i64::from(votes[*row].beside);
+            let margin = |row: &usize| i64::from(votes[*row].inside) - i64::from(votes[*row].outside);
             contradicted.sort_by_key(|row| std::cmp::Reverse(margin(row)));
             let spared = FEWEST_OF_OBJECT.saturating_sub(others.len());
             rows.extend(contradicted.into_iter().skip(spared));
@@ -121,7 +121,7 @@ impl Trainer {
                 if is_near(labels, [x, y], label) {
                     votes.inside += 1;
                 } else if !hides(&seen, [x, y], depth - f64::from(size)) {
-                    votes.beside += 1;
+                    votes.outside += 1;
                 }
             }
         }
@@ -167,7 +167,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let (mut trainer, of_ball) = trained(folder.path());
         assert!(of_ball.len() > 20, "{of_ball:?}");
-        // Ten of the ball go towards the first camera, to where all others see them beside it.
+        // Ten of the ball go towards the first camera, to where all others see them outside it.
         let camera = trainer.state.dataset.frames[trainer.state.frames.index(0)].camera;
         let place = DVec3::new(-0.55, 0.0, 0.0).lerp(camera.centre(), 0.3);
         let (moved, stay) = of_ball.split_at(10);

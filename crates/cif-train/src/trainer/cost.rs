@@ -49,7 +49,7 @@ struct Work {
     moving: f64,
 }
 
-/// Reports of a run, the last ones of which tell what a step costs.
+/// Reports of a run, the last ones of which show what a step costs.
 #[derive(Debug, Default)]
 pub(super) struct Reports(VecDeque<Report>);
 

@@ -1,4 +1,4 @@
-//! Groups that move as a whole, on a GPU beside the processor. `CIF_TEST_GPU=off|auto|require`.
+//! Groups that move as a whole, on a GPU compared with the processor. `CIF_TEST_GPU=off|auto|require`.
 
 use std::sync::Arc;
 
@@ -136,16 +136,16 @@ fn a_bad_gradient_of_a_pose_moves_nothing_and_the_steps_after_it_are_done() {
         let iteration = trainer.iteration();
         state(&mut trainer);
         device(&mut trainer).damage_poses(value);
-        let mut told = Vec::new();
+        let mut reported = Vec::new();
         for _ in 0..2 {
             let (result, events) = step(&mut trainer);
             result.unwrap();
-            told.extend(events);
+            reported.extend(events);
         }
         state(&mut trainer);
-        told.extend(std::mem::take(&mut trainer.arrived));
-        let [TrainEvent::RolledBack { iteration: at, fault, in_a_row: 1, .. }] = &told[..] else {
-            panic!("{told:?}")
+        reported.extend(std::mem::take(&mut trainer.arrived));
+        let [TrainEvent::RolledBack { iteration: at, fault, in_a_row: 1, .. }] = &reported[..] else {
+            panic!("{reported:?}")
         };
         assert_eq!(*at, iteration + 1);
         assert_eq!((fault.part, fault.tensor.as_str()), ("gradients", "gradient of poses"));

@@ -63,7 +63,7 @@ fn host(trainer: &Trainer) -> (Field, Optimiser, DensifyStatistics, Exposures) {
     )
 }
 
-/// One step, and what it told.
+/// One step, and what it reported.
 pub(super) fn step(trainer: &mut Trainer) -> (Result<(), TrainError>, Vec<TrainEvent>) {
     if trainer.stage() == Stage::Search {
         trainer.enter(Stage::Coarse).unwrap();
@@ -91,18 +91,18 @@ fn a_bad_step_moves_nothing_and_those_recorded_after_it_are_done_as_if_it_had_no
         let before = state(&mut trainer);
         let (iteration, counters) = (trainer.iteration(), before.1.clone());
         device(&mut trainer).damage(column, value);
-        let mut told = Vec::new();
+        let mut reported = Vec::new();
         for _ in 0..4 {
             let (result, events) = step(&mut trainer);
             result.unwrap();
-            told.extend(events);
+            reported.extend(events);
         }
         state(&mut trainer);
-        told.extend(std::mem::take(&mut trainer.arrived));
+        reported.extend(std::mem::take(&mut trainer.arrived));
         let [TrainEvent::RolledBack { stage: Stage::Coarse, iteration: at, fault, in_a_row: 1, total: 1 }] =
-            &told[..]
+            &reported[..]
         else {
-            panic!("{told:?}")
+            panic!("{reported:?}")
         };
         assert_eq!((*at, fault.part, fault.tensor.as_str()), (iteration + 1, "gradients", tensor));
         assert!(fault.value.contains("on the GPU alone"), "{fault}");
@@ -131,7 +131,7 @@ fn a_bad_step_moves_nothing_and_those_recorded_after_it_are_done_as_if_it_had_no
 }
 
 #[test]
-fn what_the_processor_would_refuse_too_is_told_in_its_words() {
+fn what_the_processor_would_refuse_too_is_reported_in_its_words() {
     let Some(gpu) = testing::gpu() else { return };
     let fault_on = |gpu: Option<&Gpu>| {
         let (mut trainer, _folder) = trainer(gpu);
@@ -162,16 +162,16 @@ fn too_many_bad_steps_in_a_row_stop_the_run_where_the_first_of_them_was() {
         row[0] = 3e38;
     }
     let before = trainer.state.field.clone();
-    let mut told = 0;
+    let mut reported = 0;
     let error = trainer
         .run(&mut |event, _| {
-            told += u32::from(matches!(event, TrainEvent::RolledBack { .. }));
+            reported += u32::from(matches!(event, TrainEvent::RolledBack { .. }));
             Control::Continue
         })
         .unwrap_err();
     let TrainError::Diverged { in_a_row, iteration, stage, .. } = error else { panic!("{error}") };
     assert_eq!(in_a_row, MAX_ROLLBACKS_IN_A_ROW);
-    assert_eq!(told, MAX_ROLLBACKS_IN_A_ROW - 1);
+    assert_eq!(reported, MAX_ROLLBACKS_IN_A_ROW - 1);
     assert_eq!((trainer.stage(), trainer.iteration() + 1), (stage, iteration));
     assert_eq!(trainer.steps_done(), trainer.state.progress.steps.values().sum::<u64>());
     assert!(trainer.state.field.gaussians.sh_coefficients == before.gaussians.sh_coefficients);
@@ -192,7 +192,7 @@ fn views_without_room_are_drawn_again_and_no_bit_differs() {
     let Some(gpu) = testing::gpu() else { return };
     let run = |room: usize| {
         let (mut trainer, _folder) = trainer(Some(&gpu));
-        *device(&mut trainer).wanted() = [room; 2];
+        *device(&mut trainer).needed() = [room; 2];
         let mut losses = Vec::new();
         let outcome = trainer.run(&mut |event, _| {
             if let TrainEvent::Finished { rolled_back, .. } = event {
@@ -202,14 +202,14 @@ fn views_without_room_are_drawn_again_and_no_bit_differs() {
         });
         assert_eq!(outcome.unwrap(), Outcome::Finished);
         assert_eq!(losses, [0], "room is no fault");
-        let wanted = *device(&mut trainer).wanted();
+        let needed = *device(&mut trainer).needed();
         let mut state = state(&mut trainer);
         state.0.record = Default::default();
-        (state, wanted)
+        (state, needed)
     };
     let (roomy, _) = run(1 << 17);
-    let (tight, wanted) = run(1);
-    assert!(wanted[0] > 1 && wanted[1] > 1, "views wanted room: {wanted:?}");
+    let (tight, needed) = run(1);
+    assert!(needed[0] > 1 && needed[1] > 1, "views needed room: {needed:?}");
     assert!(roomy == tight);
 }
 

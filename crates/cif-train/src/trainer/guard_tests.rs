@@ -28,7 +28,7 @@ fn state(trainer: &Trainer) -> (Field, Optimiser) {
     (trainer.state.field.clone(), trainer.state.optimiser.clone())
 }
 
-/// One step, and what it told.
+/// One step, and what it reported.
 fn step(trainer: &mut Trainer) -> (Result<(), TrainError>, Vec<TrainEvent>) {
     if trainer.stage() == Stage::Search {
         trainer.enter(Stage::Coarse).unwrap();
@@ -66,7 +66,7 @@ fn a_bad_gradient_of_an_exposure_moves_neither_exposures_nor_field() {
 }
 
 #[test]
-fn a_bad_gradient_is_rolled_back_told_and_counted() {
+fn a_bad_gradient_is_rolled_back_reported_and_counted() {
     let (mut trainer, _folder) = trainer(3);
     for debug in [false, true] {
         trainer.set_debug_validation(debug);
@@ -122,16 +122,16 @@ fn too_many_bad_steps_in_a_row_stop_the_run_which_can_be_resumed() {
         row[0] = 3e38;
     }
     let before = state(&trainer);
-    let mut told = 0;
+    let mut reported = 0;
     let error = loop {
         let (result, events) = step(&mut trainer);
-        told += events.len() as u32;
+        reported += events.len() as u32;
         if let Err(error) = result {
             break error;
         }
     };
     assert!(state(&trainer) == before);
-    assert_eq!(told, MAX_ROLLBACKS_IN_A_ROW - 1);
+    assert_eq!(reported, MAX_ROLLBACKS_IN_A_ROW - 1);
     let TrainError::Diverged { in_a_row, ref fault, .. } = error else { panic!("{error}") };
     assert_eq!((in_a_row, u64::from(in_a_row)), (MAX_ROLLBACKS_IN_A_ROW, trainer.rolled_back()));
     assert!(!fault.value.is_empty());

@@ -202,16 +202,16 @@ fn contact_depths(labels: &PixelGrid<u16>, seen: &RenderedImage, instances: usiz
             if depth <= 0.0 || *seen.alpha.at(x, y) < 0.5 {
                 continue;
             }
-            let mut beside = [x.wrapping_sub(1), x + 1, x, x]
+            let mut adjacent = [x.wrapping_sub(1), x + 1, x, x]
                 .into_iter()
                 .zip([y, y, y.wrapping_sub(1), y + 1])
                 .filter(|(x, y)| *x < width && *y < height)
                 .map(|(x, y)| *labels.at(x, y))
                 .filter(|label| *label != UNLABELLED)
                 .collect::<Vec<_>>();
-            beside.sort_unstable();
-            beside.dedup();
-            for label in beside {
+            adjacent.sort_unstable();
+            adjacent.dedup();
+            for label in adjacent {
                 rings[usize::from(label) - 1].push(f64::from(depth));
             }
         }

@@ -1,4 +1,4 @@
-//! Objects with poses beside objects on paths.
+//! Objects with poses next to objects on paths.
 
 use std::collections::BTreeMap;
 use std::f64::consts::PI;
@@ -15,7 +15,7 @@ use crate::objects::{Fitted, Found};
 use crate::stage::Stage;
 
 /// An object without poses yet, which is explained in full.
-fn told(gaussians: Gaussians) -> Fitted {
+fn explained(gaussians: Gaussians) -> Fitted {
     Fitted {
         poses: BTreeMap::new(),
         shares: BTreeMap::new(),
@@ -28,7 +28,7 @@ fn told(gaussians: Gaussians) -> Fitted {
         bent: None,
         is_ball: false,
         is_settled: false,
-        way: "told".to_owned(),
+        way: "explained".to_owned(),
     }
 }
 
@@ -41,7 +41,7 @@ fn poses_are_kept_of_balls_with_rough_masks_and_of_what_turns() {
         unturned: Some(unturned),
         is_ball,
         is_settled: true,
-        ..told(Gaussians::from_points(&[[0.0; 3]], &[[0.5; 3]]).unwrap())
+        ..explained(Gaussians::from_points(&[[0.0; 3]], &[[0.5; 3]]).unwrap())
     };
     let (observed, assumed) = (RotationEvidence::Observed, RotationEvidence::Assumed);
     let kept = |errors, rotation, is_ball| is_rigid(&fitted(errors, rotation, is_ball), 0.22);
@@ -58,7 +58,7 @@ fn poses_are_kept_of_balls_with_rough_masks_and_of_what_turns() {
     };
     assert!(bends(0.3, 1.0, false) && !bends(0.3, 0.95, false) && !bends(0.45, 1.0, false));
     assert!(bends(0.15, 0.9, false) && !bends(0.15, 0.7, false));
-    // Of what is seen from other sides all the time, bending is not told.
+    // Of what is seen from other sides all the time, bending does not show.
     assert!(!bends(0.15, 1.0, true));
 }
 
@@ -79,7 +79,7 @@ fn paths_hold_no_object_that_has_poses() {
         poses: BTreeMap::from([(0, pose), (4, pose)]),
         shares: BTreeMap::from([(0, 1.0), (4, 0.1)]),
         reference: pose,
-        ..told(gaussians)
+        ..explained(gaussians)
     };
     trainer.state.objects.rigid.insert(2, Found::Moves(Box::new(fitted)));
     trainer.enter(Stage::Fine).unwrap();
@@ -207,7 +207,7 @@ fn hidden(scene: Scene, keeps_masks: bool) -> Vec<(f64, bool)> {
         shares: poses.keys().map(|time| (*time, 1.0)).collect(),
         poses,
         reference: pose(1.0),
-        ..told(gaussians)
+        ..explained(gaussians)
     };
     trainer.state.objects.rigid.insert(3, Found::Moves(Box::new(fitted)));
     trainer.prepare_fine().unwrap();

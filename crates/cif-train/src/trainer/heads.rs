@@ -73,7 +73,7 @@ impl Trainer {
             return Ok(());
         }
         self.fetch()?;
-        let (before, told) = (self.state.keep(), events.len());
+        let (before, reported) = (self.state.keep(), events.len());
         let mut random = stream(self.state.config.seed, Purpose::HeadRearrangements, u64::from(iteration));
         for part in 0..parts {
             let change = match head.rearrange(part, iteration, steps, &mut self.training_views(), &mut random)
@@ -82,7 +82,7 @@ impl Trainer {
                 Ok(None) => continue,
                 Err(error) => {
                     self.state.put_back(before);
-                    events.truncate(told);
+                    events.truncate(reported);
                     self.engine.changed(Changed::Everything);
                     return Err(error);
                 }
@@ -114,8 +114,8 @@ impl Trainer {
             .then(|| Decoder::save(&self.state.config.head, &self.state.head_tensors))
     }
 
-    /// The head as it decodes pixels of the trained field, once a run has returned; `None` where identity rows tell
-    /// labels.
+    /// The head as it decodes pixels of the trained field, once a run has returned; `None` where identity rows give
+    /// the labels.
     #[must_use]
     pub fn decoder(&self) -> Option<Decoder> {
         Decoder::of_scene(&self.state.field, &self.saved_decoder()?).ok()

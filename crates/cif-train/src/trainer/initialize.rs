@@ -20,7 +20,7 @@ const OUTLIER_ANGLE: f64 = 0.03;
 
 /// Fewest and most time nodes chosen automatically, and the fewest where the times are enough for them.
 const TIME_NODES: (usize, usize) = (8, 150);
-const USUAL_TIME_NODES: usize = 25;
+const TYPICAL_TIME_NODES: usize = 25;
 
 /// Training images for each time node. Times use the upper half of the nodes, so that twelve images lie between two: with
 /// fewer, every image moves the Gaussians as it alone likes.
@@ -161,14 +161,14 @@ pub(crate) fn memory_of_planes(shape: &DeformationConfig) -> Need {
     }
 }
 
-/// Nodes of the time planes where the settings leave them to the capture: as many as its training images tell apart, and
+/// Nodes of the time planes where the settings leave them to the capture: as many as its training images distinguish, and
 /// no more than two for each of its times, one of which is used.
 pub(crate) fn automatic_time_nodes(times: usize, images: usize) -> u32 {
-    let told_apart = (images / IMAGES_PER_TIME_NODE).max(USUAL_TIME_NODES);
-    told_apart.min(2 * times).clamp(TIME_NODES.0, TIME_NODES.1) as u32
+    let distinguished = (images / IMAGES_PER_TIME_NODE).max(TYPICAL_TIME_NODES);
+    distinguished.min(2 * times).clamp(TIME_NODES.0, TIME_NODES.1) as u32
 }
 
-/// Points of the capture with colours in [0, 1], thinned to the wanted number.
+/// Points of the capture with colours in [0, 1], thinned to the requested number.
 fn initial_points(dataset: &Dataset, config: &TrainConfig) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
     let points = dataset.points.thinned(config.model.max_initial_points as usize);
     let colors = points.colors.iter().map(|color| color.map(|c| f32::from(c) / 255.0)).collect();

@@ -76,7 +76,7 @@ impl Trainer {
         Ok(trainer)
     }
 
-    /// One step of the present stage, also past its end; tells where its time went.
+    /// One step of the present stage, also past its end; reports where its time went.
     ///
     /// # Errors
     /// As [`Trainer::run`].

@@ -26,7 +26,7 @@ impl MeasuredFrames {
         };
         let training = of_split(dataset);
         let count = (config.report.withhold as usize).min(training.len() / FRAMES_PER_WITHHELD);
-        // Frames with masks tell more; where they are few, all of them are needed for training.
+        // Frames with masks show more; where they are few, all of them are needed for training.
         let masked: Vec<usize> =
             training.iter().copied().filter(|index| dataset.frames[*index].mask.is_some()).collect();
         let pool = if masked.len() >= FRAMES_PER_WITHHELD * count { &masked } else { &training };

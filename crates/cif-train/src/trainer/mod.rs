@@ -8,7 +8,7 @@
 //! | `plan_step` | what decides a step |
 //! | `step` | how a step is done, and what falls behind it |
 //! | `heads` | what heads of other systems see and change between steps |
-//! | `guidance` | how travelling objects start on the paths that masks tell |
+//! | `guidance` | how travelling objects start on the paths that masks show |
 //! | `seeds` | what objects begin with that nothing was made of |
 //! | `objects`, `parts` | which objects move as a whole or in a part, and how they join the field |
 //! | `identity` | how identity rows come about |
@@ -300,7 +300,7 @@ impl Trainer {
         &self.state.progress.curve
     }
 
-    /// Looks at every array of a step, so that a value which is not finite is told with the part, the tensor and
+    /// Looks at every array of a step, so that a value which is not finite is reported with the part, the tensor and
     /// the index where it first appeared. Costs time and a second copy of field and moments; results do not
     /// change.
     pub fn set_debug_validation(&mut self, on: bool) {

@@ -8,7 +8,7 @@ use cif_dataset::{Dataset, PointSource};
 use glam::DVec3;
 
 /// Near plane where nothing says that the scene comes nearer, units of the capture, as in 3DGS.
-const USUAL: f64 = 0.2;
+const TYPICAL: f64 = 0.2;
 
 /// Share of the depths at which cameras see points that are taken for mismatches.
 const MISMATCHES: f64 = 0.01;
@@ -19,7 +19,7 @@ const MISMATCHES: f64 = 0.01;
 const OF_RIG: f64 = 0.7;
 
 /// The same where points are of what stands still alone: what moves may pass much nearer, and is not drawn nearer than
-/// [`USUAL`]. Not measured.
+/// [`TYPICAL`]. Not measured.
 const OF_WALK: f64 = 0.5;
 
 /// The same where points were drawn at random, from which little follows. Not measured.
@@ -31,11 +31,11 @@ const POINTS: usize = 2_000;
 
 /// Depth from which on Gaussians are drawn, units of the capture.
 pub(super) fn automatic(dataset: &Dataset) -> f32 {
-    let Some(nearest) = nearest(dataset) else { return USUAL as f32 };
+    let Some(nearest) = nearest(dataset) else { return TYPICAL as f32 };
     let near = match dataset.points.source {
-        PointSource::Random => (OF_RANDOM * nearest).min(USUAL),
+        PointSource::Random => (OF_RANDOM * nearest).min(TYPICAL),
         _ if dataset.is_rig() => OF_RIG * nearest,
-        _ => (OF_WALK * nearest).min(USUAL),
+        _ => (OF_WALK * nearest).min(TYPICAL),
     };
     near as f32
 }
@@ -108,18 +108,18 @@ mod tests {
     #[test]
     fn what_moves_before_one_camera_may_be_nearer_than_its_points() {
         let far = automatic(&seen_at(1, 3.0, 1.0, PointSource::Triangulated));
-        assert_eq!(far, USUAL as f32);
+        assert_eq!(far, TYPICAL as f32);
         let close = f64::from(automatic(&seen_at(1, 0.02, 0.05, PointSource::Triangulated)));
         assert!((close / (OF_WALK * 0.02) - 1.0).abs() < 0.1, "a small scene: {close}");
     }
 
     #[test]
     fn without_measured_points_little_is_known() {
-        assert_eq!(automatic(&seen_at(4, 5.0, 1.0, PointSource::Random)), USUAL as f32);
+        assert_eq!(automatic(&seen_at(4, 5.0, 1.0, PointSource::Random)), TYPICAL as f32);
         let small = f64::from(automatic(&seen_at(4, 0.1, 0.1, PointSource::Random)));
         assert!((small / (OF_RANDOM * 0.1) - 1.0).abs() < 0.1, "{small}");
         let mut none = seen_at(4, 5.0, 1.0, PointSource::Random);
         none.points.positions.clear();
-        assert_eq!(automatic(&none), USUAL as f32);
+        assert_eq!(automatic(&none), TYPICAL as f32);
     }
 }

@@ -34,7 +34,7 @@ const MOST_OF_BALL: f64 = 0.24;
 const TURN_EXPLAINS: f64 = 0.5;
 
 /// Error of bending, of that of a rigid object, up to which an object deforms, whatever its error, and how much larger than
-/// usual what is left may be where bending explains no better: rough masks of small things leave much.
+/// typical what is left may be where bending explains no better: rough masks of small things leave much.
 const DEFORMS: f64 = 0.85;
 const ROUGH: f64 = 2.0;
 
@@ -43,7 +43,7 @@ const LOOKS: usize = 30;
 const APART: usize = 3;
 const OPAQUE: f32 = 0.9;
 
-/// Largest distance between cameras, of the middle depth, from which views tell depths.
+/// Largest distance between cameras, of the middle depth, from which views determine depths.
 const PARALLAX: f64 = 0.1;
 
 /// Way that a pose can go in the fine stage, of the size of its object: as far as times that no mask shows may be off.
@@ -126,8 +126,8 @@ impl Trainer {
         }
     }
 
-    /// Refuses motion that is told of objects that there are not.
-    pub(super) fn check_told(&self) -> Result<(), TrainError> {
+    /// Refuses motion that is declared of objects that there are not.
+    pub(super) fn check_declared(&self) -> Result<(), TrainError> {
         let labels: Vec<String> = self.state.field.instances.iter().map(|i| i.label.clone()).collect();
         match self.state.config.motion.of.keys().find(|label| !labels.contains(label)) {
             None => Ok(()),
@@ -185,8 +185,9 @@ impl Trainer {
         let far = |centre: &DVec3| centres.iter().map(|other| other.distance(*centre)).fold(0.0, f64::max);
         let apart = centres.iter().map(far).fold(0.0, f64::max);
         depths_seen.sort_by(f64::total_cmp);
-        let is_told = depths_seen.get(depths_seen.len() / 2).is_some_and(|middle| apart > PARALLAX * middle);
-        Ok(if is_told { points } else { Vec::new() })
+        let shows_depths =
+            depths_seen.get(depths_seen.len() / 2).is_some_and(|middle| apart > PARALLAX * middle);
+        Ok(if shows_depths { points } else { Vec::new() })
     }
 
     /// Facts that fits of objects need.
@@ -234,22 +235,24 @@ impl Trainer {
         entered.until(self.deadline(phase));
         let surroundings = self.surroundings(plane, &order);
         let most = MOST_ERROR[usize::from(state.dataset.points.source == PointSource::Random)];
-        let wanted: Vec<(u16, Option<ObjectMotion>)> =
+        let candidates: Vec<(u16, Option<ObjectMotion>)> =
             labels.iter().map(|label| (*label, self.state.told(*label))).collect();
-        let fit = |(label, told): &(u16, Option<ObjectMotion>)| {
-            let is_told = *told == Some(ObjectMotion::Rigid);
-            let found = if *told == Some(ObjectMotion::Free) {
+        let fit = |(label, declared): &(u16, Option<ObjectMotion>)| {
+            let is_declared = *declared == Some(ObjectMotion::Rigid);
+            let found = if *declared == Some(ObjectMotion::Free) {
                 Some(Found::Nothing)
             } else {
-                in_time(objects::fit(*label, &state.dataset, &state.frames, surroundings, is_told))?
+                in_time(objects::fit(*label, &state.dataset, &state.frames, surroundings, is_declared))?
             };
             state.phases.advance();
             Ok(match found {
-                Some(Found::Moves(fitted)) if !is_told && !is_rigid(&fitted, most) => Some(Found::Nothing),
+                Some(Found::Moves(fitted)) if !is_declared && !is_rigid(&fitted, most) => {
+                    Some(Found::Nothing)
+                }
                 found => found,
             })
         };
-        let found: Vec<Result<Option<Found>, TrainError>> = wanted.par_iter().map(fit).collect();
+        let found: Vec<Result<Option<Found>, TrainError>> = candidates.par_iter().map(fit).collect();
         drop(entered);
         let (mut left_out, mut failed) = (Vec::new(), None);
         for (label, found) in labels.iter().zip(found) {

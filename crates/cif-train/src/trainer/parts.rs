@@ -1,4 +1,4 @@
-//! Objects with a part on a joint: found where an object rests but for a part, given Gaussians in two groups, of which
+//! Objects with a part on a joint: found where an object is at rest but for a part, given Gaussians in two groups, of which
 //! that of the part moves on the joint.
 
 use cif_field::Instance;
@@ -14,7 +14,7 @@ use crate::phase::Phase;
 
 impl Trainer {
     /// Looks for parts of objects (labels: dense index + 1) that do not travel, nor move as a whole, and of which nothing
-    /// is told: among all that moves, a joint far away does what travelling does.
+    /// is declared: among all that moves, a joint far away does what travelling does.
     pub(super) fn find_parts(&mut self, labels: &[u16], plane: Option<&Plane>) -> Result<(), TrainError> {
         let motion = &self.state.config.motion;
         if !motion.rigid || !motion.parts {
@@ -22,13 +22,13 @@ impl Trainer {
         }
         let known = &self.state.objects;
         let is_open = |label: &u16| known.moving(*label).is_none() && self.state.told(*label).is_none();
-        let wanted: Vec<u16> = labels.iter().copied().filter(is_open).collect();
+        let candidates: Vec<u16> = labels.iter().copied().filter(is_open).collect();
         let is_known = |label: &&u16| known.parts.contains_key(*label);
-        let unknown: Vec<u16> = wanted.iter().filter(|label| !is_known(label)).copied().collect();
+        let unknown: Vec<u16> = candidates.iter().filter(|label| !is_known(label)).copied().collect();
         if !unknown.is_empty() {
             self.find_unknown_parts(&unknown, plane)?;
         }
-        for label in wanted {
+        for label in candidates {
             if self.state.objects.jointed(label).is_some() {
                 self.state.guidance.travelling[usize::from(label)] = true;
             }

@@ -88,7 +88,7 @@ impl Trainer {
     }
 }
 
-/// Largest resident memory of this process so far, MB; `None` where the system does not tell.
+/// Largest resident memory of this process so far, MB; `None` where the system does not report it.
 pub(super) fn peak_rss_mb() -> Option<f64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find(|line| line.starts_with("VmHWM:"))?;

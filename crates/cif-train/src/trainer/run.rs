@@ -24,7 +24,7 @@ use crate::step::StepLoss;
 /// Observer of a run.
 type Observer<'a> = dyn FnMut(&TrainEvent, &TrainerView<'_>) -> Control + 'a;
 
-/// Share of unsupported pixels from which the user is told (methods reference 4.4).
+/// Share of unsupported pixels from which the user is warned (methods reference 4.4).
 const MANY_UNSUPPORTED: f64 = 0.01;
 
 /// Requests of the observer that have not been carried out yet.

@@ -22,10 +22,10 @@ use crate::tracks::{Observation, Track};
 /// Opacity that they start with.
 const OPACITY: f32 = 0.4;
 
-/// Share of the frames in which a point of an object may fall beside its mask.
+/// Share of the frames in which a point of an object may fall outside its mask.
 const OUTSIDE: f64 = 0.15;
 
-/// Views of an object that tell whether Gaussians lie inside its masks, spread evenly.
+/// Views of an object that decide whether Gaussians lie inside its masks, spread evenly.
 const LOOKS: usize = 30;
 
 /// Centres and colours in [0, 1].
@@ -47,18 +47,18 @@ impl Trainer {
             .filter(|row| gaussians.opacity(*row as usize) >= state.config.densify.prune_opacity)
             .collect();
         // Labels to look for, by view.
-        let mut wanted: BTreeMap<usize, BTreeSet<u16>> = BTreeMap::new();
+        let mut requested: BTreeMap<usize, BTreeSet<u16>> = BTreeMap::new();
         let mut looks: BTreeMap<u16, usize> = BTreeMap::new();
         for label in (1..=state.field.instances.len() as u16).filter(|label| !others.contains(label)) {
             let views: Vec<usize> = (0..masks.len()).filter(|view| shows(*view, label)).collect();
             for view in views.iter().step_by(views.len().div_ceil(LOOKS).max(1)) {
-                wanted.entry(*view).or_default().insert(label);
+                requested.entry(*view).or_default().insert(label);
                 *looks.entry(label).or_default() += 1;
             }
         }
         // Gaussians inside the mask of a label, once a view.
         let mut inside: Vec<(u16, u32)> = Vec::new();
-        for (view, wanted) in &wanted {
+        for (view, requested) in &requested {
             state.phases.check()?;
             let data = state.frames.get(&state.dataset, *view)?;
             let Some(labels) = &data.labels else { continue };
@@ -66,7 +66,7 @@ impl Trainer {
             inside.extend(drawn.iter().filter_map(|row| {
                 let place = DVec3::from(gaussians.means[*row as usize].map(f64::from));
                 let label = camera.pixel_of(place).map(|[x, y]| *labels.at(x, y))?;
-                wanted.contains(&label).then_some((label, *row))
+                requested.contains(&label).then_some((label, *row))
             }));
         }
         inside.sort_unstable();
@@ -93,8 +93,8 @@ impl Trainer {
         let (mut positions, mut colors) = self.inside_masks(label, &track, reference, seen)?;
         if positions.len() < FEWEST_OF_OBJECT {
             // About one a pixel draws it as it is seen.
-            let wanted = (self.state.config.motion.gaussians as usize).min(best.area_px as usize);
-            (positions, colors) = self.inside_mask(label, reference, best, wanted)?;
+            let count = (self.state.config.motion.gaussians as usize).min(best.area_px as usize);
+            (positions, colors) = self.inside_mask(label, reference, best, count)?;
         }
         if positions.len() < FEWEST_OF_OBJECT {
             return Ok(());
@@ -121,7 +121,7 @@ impl Trainer {
     ) -> Result<Points, TrainError> {
         let times = &self.state.dataset.times;
         let mut rng = stream(self.state.config.seed, Purpose::Guidance, u64::from(label));
-        let wanted = self.state.config.motion.gaussians as usize;
+        let count = self.state.config.motion.gaussians as usize;
         let frames: Vec<_> = (0..self.state.frames.len())
             .map(|view| {
                 self.state.phases.check()?;
@@ -129,8 +129,8 @@ impl Trainer {
             })
             .collect::<Result<_, TrainError>>()?;
         let (mut positions, mut colors) = (Vec::new(), Vec::new());
-        for _ in 0..wanted * 40 {
-            if positions.len() == wanted {
+        for _ in 0..count * 40 {
+            if positions.len() == count {
                 break;
             }
             self.state.phases.check()?;

@@ -240,14 +240,14 @@ impl Trainer {
         iteration: u32,
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
-        let told = events.len();
+        let reported = events.len();
         let before =
             (self.state.field.clone(), self.state.optimiser.of(&MLP).clone(), self.state.progress.still_rung);
         let result = self.judge(effect, stage, iteration, events);
         if result.is_err() {
             (self.state.field, *self.state.optimiser.of(&MLP), self.state.progress.still_rung) = before;
             self.state.gradients = Gradients::zeros(&self.state.field);
-            events.truncate(told);
+            events.truncate(reported);
         }
         result
     }

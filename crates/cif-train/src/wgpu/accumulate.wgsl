@@ -1,6 +1,6 @@
 // Adds the gradients of a view to those of the step, and what densification keeps of a step: summed norms of the screen
-// gradient, steps in which a Gaussian was visible, its largest radius; sums that no optimiser may take are told. Rust twins: cpu/renderer/backward.rs
-// `project_backward`, densify.rs `DensifyStatistics::add`. Source: methods reference 1.5.
+// gradient, steps in which a Gaussian was visible, its largest radius; sums that no optimiser may take are reported. Rust
+// twins: cpu/renderer/backward.rs `project_backward`, densify.rs `DensifyStatistics::add`. Source: methods reference 1.5.
 
 #import constants
 #import accumulation

@@ -155,10 +155,10 @@ fn hold_joints() {
             continue;
         }
         let base = groups[part.joint.y];
-        let rests = base.poses.x == base.poses.y;
+        let at_rest = base.poses.x == base.poses.y;
         for (var at = part.poses.x; at < part.poses.y; at++) {
             var base_pose = Pose(vec4f(1.0, 0.0, 0.0, 0.0), vec4f(0.0));
-            if !rests {
+            if !at_rest {
                 base_pose = poses[base.poses.x + at - part.poses.x];
             }
             hold(part, base.pivot.xyz, base_pose, at);

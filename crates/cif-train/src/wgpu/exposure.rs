@@ -119,7 +119,7 @@ impl GpuExposure {
         Ok(())
     }
 
-    /// Records the way back: `v_colors`, by the recorded colours, become those by the colours of the view, and the camera gets its
+    /// Records the backward pass: `v_colors`, by the recorded colours, become those by the colours of the view, and the camera gets its
     /// gradient. To be recorded after [`Self::expose`] of the same view.
     pub(crate) fn pull_back(
         &self,

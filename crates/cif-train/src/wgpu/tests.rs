@@ -441,12 +441,12 @@ fn steps_wait_after_what_counts_and_only_then() {
         (good, fits, bit(&MEANS), bit(&MEANS) | bit(&SH_COEFFICIENTS), 1, bit(&MEANS), 1),
         (good, fits, bit(&MEANS), bit(&SH_COEFFICIENTS), 1, bit(&MEANS), 0),
     ];
-    for (at, ((sums, similarity), [wanted, drawn], before, counts, is_last, bits, waits)) in
+    for (at, ((sums, similarity), [needed, drawn], before, counts, is_last, bits, waits)) in
         cases.into_iter().enumerate()
     {
         let results = GpuVec::from_slice(&gpu, "results", &[[9.0; 4], [9.0; 4], sums, similarity]).unwrap();
         let mut words = vec![0; GpuStatistics::WORDS];
-        (words[GpuStatistics::WANTED_PAIRS], words[GpuStatistics::PAIRS]) = (wanted, drawn);
+        (words[GpuStatistics::WANTED_PAIRS], words[GpuStatistics::PAIRS]) = (needed, drawn);
         let words = GpuVec::from_slice(&gpu, "counts", &words).unwrap();
         let faults = GpuVec::from_slice(&gpu, "faults", &[before, 0_u32, 0, 0]).unwrap();
         let mut commands = Commands::new(&gpu, None);

@@ -223,8 +223,8 @@ fn lang_splat_learns_maps_and_answers_questions() {
     let nowhere = HeadConfig { maps: "nowhere".into(), ..named(HeadName::LangSplat) };
     let (_, dataset, reconstruction) = &*RECONSTRUCTION;
     let config = TrainConfig { head: nowhere, ..config() };
-    let told = Trainer::from_scene(dataset.clone(), config, reconstruction.clone(), "base.cif");
-    assert!(told.err().unwrap().to_string().contains("nowhere"));
+    let refused = Trainer::from_scene(dataset.clone(), config, reconstruction.clone(), "base.cif");
+    assert!(refused.err().unwrap().to_string().contains("nowhere"));
 }
 
 #[test]

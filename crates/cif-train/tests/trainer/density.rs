@@ -87,9 +87,9 @@ fn a_strategy_that_is_declared_here_changes_the_set_on_its_steps_alone() {
     trainer.field().validate().unwrap();
 
     // Today's rules do something else.
-    let mut usual = Trainer::new(dataset.clone(), config()).unwrap();
-    run(&mut usual, None);
-    assert_ne!(usual.field().len(), left);
+    let mut current = Trainer::new(dataset.clone(), config()).unwrap();
+    run(&mut current, None);
+    assert_ne!(current.field().len(), left);
 
     // A resumed run that is given the strategy again ends where the other did.
     let mut config = config();

@@ -263,7 +263,7 @@ fn exposures_are_learnt_where_cameras_disagree() {
 }
 
 #[test]
-fn a_camera_that_adapts_while_it_films_is_told_from_what_it_sees() {
+fn a_camera_that_adapts_while_it_films_is_recognised_from_what_it_sees() {
     let folder = tempfile::tempdir().unwrap();
     let scene = Scene { times: 8, views: 8, one_camera: true, disagree: true, ..Scene::default() };
     let mut dataset = with_known_points(capture(folder.path(), scene));

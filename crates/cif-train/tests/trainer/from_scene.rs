@@ -80,7 +80,7 @@ fn it_begins_where_the_reconstruction_of_a_whole_run_ends() {
     field.validate().unwrap();
     assert!(field.identities.is_some());
 
-    // An interrupted one goes on, and still tells where it came from.
+    // An interrupted one goes on, and still records where it came from.
     let mut begun = Trainer::from_scene(dataset.clone(), config.clone(), scene, "a.cif").unwrap();
     let mut steps = 0;
     let outcome = begun.run(&mut |event, _| {

@@ -1,4 +1,4 @@
-//! Runs on a GPU beside the same runs on the processor. `CIF_TEST_GPU=off|auto|require` says whether they run.
+//! Runs on a GPU compared with the same runs on the processor. `CIF_TEST_GPU=off|auto|require` says whether they run.
 
 use crate::support::{Scene, capture, relative_gain, small_config, with_known_points};
 use cif_dataset::Dataset;

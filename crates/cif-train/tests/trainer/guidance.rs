@@ -18,7 +18,7 @@ fn dataset(folder: &std::path::Path, times: usize) -> Dataset {
     dataset
 }
 
-/// The same with points that are told to be where things rest, which rigid objects need.
+/// The same with points that are declared to be where things are at rest, which rigid objects need.
 fn with_support(folder: &std::path::Path, times: usize) -> Dataset {
     let mut dataset = dataset(folder, times);
     dataset.points.source = PointSource::File(folder.join("points.ply"));
@@ -54,7 +54,7 @@ fn path(field: &Field, instance: usize) -> DVec3 {
 }
 
 /// The same with densification as in 3DGS: of the many Gaussians that a set by errors puts on what moves, a run of this
-/// length leaves too many beside the path.
+/// length leaves too many off the path.
 fn by_gradient() -> TrainConfig {
     let mut config = guided();
     config.densify.rule = DensifyRule::Gradient;
@@ -134,8 +134,8 @@ fn masks_tell_early_what_stands_still() {
             .unwrap();
         (tests, trainer.into_field())
     };
-    let (told, field) = tests(&config);
-    assert!(told[0].0 == 15 && told[0].1 > 0.5, "{told:?}");
+    let (tested, field) = tests(&config);
+    assert!(tested[0].0 == 15 && tested[0].1 > 0.5, "{tested:?}");
     let followed = path(&field, 2);
     assert!((followed - DVec3::new(TRAVEL, 0.0, 0.0)).length() < 0.25, "{followed}");
     let still = &field.deformation.as_ref().unwrap().still;
@@ -148,7 +148,7 @@ fn masks_tell_early_what_stands_still() {
     ball.retain(|row| (DVec3::from(means[*row as usize].map(f64::from)) - start).length() < 0.25);
     assert!(ball.len() > 10 && share(&ball) < 0.1, "{} of {}", share(&ball), ball.len());
     assert!(share(&field.members(0)) > 0.5, "{}", share(&field.members(0)));
-    // Without paths, what the network learns first has to tell.
+    // Without paths, what the network learns first has to decide.
     (config.stages.fine, config.motion.guidance) = (guided().stages.fine, 0.0);
     assert_eq!(tests(&config).0[0].0, 45);
 }
@@ -224,7 +224,7 @@ fn check_rigid_object([coarse, fine, instance]: [u32; 3], use_engine: impl Fn(&m
 }
 
 #[test]
-fn the_motion_of_an_object_can_be_told() {
+fn the_motion_of_an_object_can_be_declared() {
     let folder = tempfile::tempdir().unwrap();
     let dataset = with_support(folder.path(), 12);
     let mut config = guided();
@@ -246,31 +246,31 @@ fn the_motion_of_an_object_can_be_told() {
 }
 
 #[test]
-fn an_object_of_which_nothing_tells_the_distance_is_named() {
+fn an_object_of_which_nothing_shows_the_distance_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let mut config = guided();
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (2, 2, 0);
-    let told = |dataset: Dataset, config: &TrainConfig| {
-        let mut told = Vec::new();
+    let warnings = |dataset: Dataset, config: &TrainConfig| {
+        let mut warned = Vec::new();
         let mut trainer = Trainer::new(dataset, config.clone()).unwrap();
         let outcome = trainer.run(&mut |event, _| {
             if let TrainEvent::Warning { message } = event {
-                told.push(message.clone());
+                warned.push(message.clone());
             }
             Control::Continue
         });
         assert_eq!(outcome.unwrap(), Outcome::Finished);
-        told.into_iter().filter(|message| message.contains("depth uncertain")).collect::<Vec<_>>()
+        warned.into_iter().filter(|message| message.contains("depth uncertain")).collect::<Vec<_>>()
     };
     let mut dataset = dataset(folder.path(), 12);
-    // A camera that goes round would tell it.
+    // A camera that goes round would show it.
     let camera = dataset.frames[0].camera;
     dataset.frames.iter_mut().for_each(|frame| frame.camera = camera);
-    let found = told(dataset.clone(), &config);
+    let found = warnings(dataset.clone(), &config);
     assert!(found.iter().any(|message| message.starts_with("ball 9: depth uncertain")), "{found:?}");
     assert!(found.iter().all(|message| !message.contains("rigid")), "{found:?}");
     config.motion.of.insert("ball 9".to_owned(), ObjectMotion::Rigid);
-    let found = told(dataset, &config);
+    let found = warnings(dataset, &config);
     assert!(
         found.iter().any(|message| message.contains("a second camera")),
         "says what is missing: {found:?}"
@@ -388,11 +388,11 @@ fn a_wrong_camera_is_named_and_left_out() {
     let centre = pose.inverse().translation;
     pose.rotation = glam::DMat3::from_rotation_y(std::f64::consts::FRAC_PI_2) * pose.rotation;
     pose.translation = -(pose.rotation * centre);
-    let told = messages(&wrong, &config);
-    assert!(told.iter().any(|message| message.starts_with("left out of training: 5_5:")), "{told:?}");
-    assert!(told.iter().any(|message| message.ends_with("masks: ball 9")), "{told:?}");
+    let found = messages(&wrong, &config);
+    assert!(found.iter().any(|message| message.starts_with("left out of training: 5_5:")), "{found:?}");
+    assert!(found.iter().any(|message| message.ends_with("masks: ball 9")), "{found:?}");
     // With the frame, everything seems to travel.
     config.motion.misfit = 0.0;
-    let told = messages(&wrong, &config);
-    assert!(told.iter().any(|message| message.ends_with("masks: ball 4, ball 7, ball 9")), "{told:?}");
+    let found = messages(&wrong, &config);
+    assert!(found.iter().any(|message| message.ends_with("masks: ball 4, ball 7, ball 9")), "{found:?}");
 }

@@ -45,10 +45,10 @@ fn more_gaussians_than_memory_holds_are_refused_before_the_first_step() {
     if cif_system::memory::available().is_none() {
         return;
     }
-    let told = trainer.run(&mut |_, _| Control::Continue).unwrap_err().to_string();
+    let message = trainer.run(&mut |_, _| Control::Continue).unwrap_err().to_string();
     assert!(
-        told.contains("densify.max_gaussians: it takes 4123.2 GB of memory (4294967295 Gaussians x 60"),
-        "{told}"
+        message.contains("densify.max_gaussians: it takes 4123.2 GB of memory (4294967295 Gaussians x 60"),
+        "{message}"
     );
     assert!(!trainer.has_begun());
 }

@@ -53,7 +53,7 @@ fn a_budget_ends_every_stage_on_time() {
         assert!(steps("fine") < u64::from(planned.fine) && steps("fine") > 60, "{record:#}");
         assert!(steps("instance") < u64::from(planned.instance) && steps("instance") > 20);
         let config = trainer.config();
-        assert_eq!(u64::from(config.stages.fine), steps("fine"), "the settings tell what was done");
+        assert_eq!(u64::from(config.stages.fine), steps("fine"), "the settings state what was done");
         assert!(config.densify.until < config.stages.fine && config.resample.until < config.stages.instance);
         assert_eq!(record["goals"]["budget"]["seconds"], 60.0);
         trainer.into_field().validate().unwrap();
@@ -145,7 +145,7 @@ fn targets_end_a_run_as_soon_as_they_are_reached() {
 }
 
 #[test]
-fn targets_out_of_reach_are_told_on_the_way_and_at_the_end() {
+fn targets_out_of_reach_are_reported_on_the_way_and_at_the_end() {
     let mut config = small_config();
     (config.stages.fine, config.stages.instance, config.report.withhold) = (1_000, 100, 3);
     let (trainer, warnings) = with_target(Targets { psnr: Some(60.0), miou: None }, config);

@@ -444,5 +444,5 @@ fn far_points_do_not_fill_the_images() {
         evaluate::<EvaluationError>(&field, dataset, &options, |_| Ok(())).unwrap().overall.psnr.unwrap()
     };
     let (alone, together) = (psnr(&near), psnr(&far));
-    assert!(together > alone - 0.5, "{together} dB beside {alone} dB without far points");
+    assert!(together > alone - 0.5, "{together} dB compared with {alone} dB without far points");
 }

@@ -1,6 +1,6 @@
 //! Value clips: what `/World` shows window by window, where a long capture was trained so.
 //!
-//! A layer per window beside the payloads holds the arrays of its splats as time samples, from its first time code on, and
+//! A layer per window next to the payloads holds the arrays of its splats as time samples, from its first time code on, and
 //! a manifest names all that change. Payloads keep those of the first window, which show where no time is asked for: what
 //! a layer says itself is stronger than its clips, and payloads are weaker.
 

@@ -16,7 +16,7 @@ const NOTHING: [&str; 4] = ["raw", "data", "unknown", "identity"];
 const LINEAR: &str = "lin_rec709_scene";
 
 /// Encoding of the colours of an attribute; `None` where they are display values, or where it is not known, which is
-/// told.
+/// reported.
 pub(super) fn encoding<'py>(
     reading: &Reading<'_, 'py>,
     place: &str,

@@ -152,7 +152,7 @@ UsdGeom.Xformable(prim).AddScaleOp().Set(Gf.Vec3f(1, 2, 1))
 ",
     );
     let Motion::Rigid(track) = &graph.nodes[0].motion else { panic!("{:?}", graph.nodes[0].motion) };
-    assert_eq!(track.len(), 11, "every frame: angles beyond a half turn are no straight way");
+    assert_eq!(track.len(), 11, "every frame: angles beyond a half turn are not the shorter arc");
     let scale = DMat3::from_diagonal(DVec3::new(1.0, 2.0, 1.0));
     for frame in [0.0_f64, 3.0, 10.0] {
         let turn = DMat3::from_rotation_z((27.0 * frame).to_radians());
@@ -215,7 +215,7 @@ prim.GetAttribute('radiance:sphericalHarmonicsCoefficientsh').Set([(k, 0, 0) for
 }
 
 #[test]
-fn axis_unit_and_colours_are_told() {
+fn axis_unit_and_colours_are_reported() {
     let _session = session();
     let graph = read(
         "
@@ -344,8 +344,8 @@ for k, key in enumerate(['semanticData', 'semanticLabel']):
     let labelled = |path: &std::path::Path, label: &str| -> Vec<String> {
         let asked = LabelQuery { pattern: label.to_owned(), time_code: None };
         let found = query(path, &asked, ReadOptions::default()).unwrap();
-        let wanted = ObjectQuery { label: Some(label.to_owned()), ..ObjectQuery::default() };
-        let searched = search(path, &wanted, ReadOptions::default()).unwrap();
+        let object_query = ObjectQuery { label: Some(label.to_owned()), ..ObjectQuery::default() };
+        let searched = search(path, &object_query, ReadOptions::default()).unwrap();
         let paths: Vec<String> = found.into_iter().map(|object| object.path).collect();
         assert_eq!(paths, searched.into_iter().map(|object| object.found.path).collect::<Vec<_>>());
         paths

@@ -177,10 +177,10 @@ fn a_far_scene_stands_in_the_world_of_its_capture() {
         assert_eq!(head.contains("double3 xformOp:translate"), !frame.is_identity(), "{head}");
         assert_eq!(head.contains("double3 xformOp:scale"), frame.scale != 1.0, "{head}");
         // Queries of the stage and of the graph give the same places in the world.
-        let wanted = LabelQuery { pattern: "*".into(), time_code: Some(graph.time_codes.start()) };
+        let label_query = LabelQuery { pattern: "*".into(), time_code: Some(graph.time_codes.start()) };
         let (stage, scene) = (
-            crate::query(&path, &wanted, ReadOptions::default()).unwrap(),
-            cif_scene::query(&graph, &wanted, "graph").unwrap(),
+            crate::query(&path, &label_query, ReadOptions::default()).unwrap(),
+            cif_scene::query(&graph, &label_query, "graph").unwrap(),
         );
         assert_eq!(stage.len(), scene.len());
         for (a, b) in stage.iter().zip(&scene) {
@@ -254,13 +254,13 @@ fn joints_of_parts_leave_between_their_bodies_and_come_back() {
             export(&written, &path, ExportOptions::default()).unwrap();
             let text = std::fs::read_to_string(&path).unwrap();
             let name = &written.nodes[0].name;
-            for wanted in [
+            for expected in [
                 prim_type.to_owned(),
                 format!("rel physics:body0 = </World/{name}/part_00>"),
                 format!("rel physics:body1 = </World/{name}/part_01>"),
                 "physics:lowerLimit".to_owned(),
             ] {
-                assert!(text.contains(&wanted), "{wanted} in {text}");
+                assert!(text.contains(&expected), "{expected} in {text}");
             }
             // Simulators solve joints that are enabled, and Newton wants these to belong to an articulation.
             let disabled = text.matches("physics:jointEnabled = 0").count();

@@ -64,8 +64,8 @@ for want in json.load(open(path.rsplit(".", 1)[0] + ".json")):
     lengths.setdefault(want["prim"], set()).add(count)
     positions = get("positions")
     assert len(positions) == count, (want["prim"], want["code"], len(positions), count)
-    for found, wanted in zip(positions, want["local"]):
-        assert math.dist(found, wanted) < 1e-5, (want["prim"], want["code"], found, wanted)
+    for found, expected in zip(positions, want["local"]):
+        assert math.dist(found, expected) < 1e-5, (want["prim"], want["code"], found, expected)
     for name in ("orientations", "scales", "opacities"):
         assert len(get(name)) == count, (name, want["code"])
     assert len(get("radiance:sphericalHarmonicsCoefficients")) == want["colors"]
@@ -116,8 +116,8 @@ fn splats_of_every_window_show_at_its_time_and_objects_keep_one_path() {
             }
         }
         check(&moved.join(name), &graph);
-        let wanted = LabelQuery { pattern: graph.nodes[1].label.clone(), time_code: Some(12.0) };
-        let found = query(&moved.join(name), &wanted, ReadOptions::default()).unwrap();
+        let label_query = LabelQuery { pattern: graph.nodes[1].label.clone(), time_code: Some(12.0) };
+        let found = query(&moved.join(name), &label_query, ReadOptions::default()).unwrap();
         assert!(found.iter().any(|found| found.instance == graph.nodes[1].name), "{found:?}");
         let read = read_scene(&moved.join(name)).unwrap();
         assert_same(&read, &graph);

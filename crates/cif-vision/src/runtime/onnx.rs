@@ -108,8 +108,8 @@ impl Session {
                 format!("name its part in {MANIFEST} as an output of the model before it"),
             ));
         }
-        let wanted: Vec<String> = self.outputs.values().map(|declared| declared.name.clone()).collect();
-        let outputs = self.place.run(inputs, &wanted).map_err(failed)?;
+        let requested: Vec<String> = self.outputs.values().map(|declared| declared.name.clone()).collect();
+        let outputs = self.place.run(inputs, &requested).map_err(failed)?;
         Ok(self.outputs.keys().cloned().zip(outputs).collect())
     }
 }

@@ -75,24 +75,24 @@ impl Place {
         }
     }
 
-    /// The wanted outputs of the model.
+    /// The requested outputs of the model.
     ///
     /// # Errors
     /// When it fails, in words.
     pub(super) fn run(
         &mut self,
         given: Vec<(String, Tensor)>,
-        wanted: &[String],
+        requested: &[String],
     ) -> Result<Vec<Tensor>, String> {
         match self {
             Self::Apart(worker) => {
                 let (names, tensors) = given.into_iter().unzip();
-                match worker.ask(&Question::Run { names, wanted: wanted.to_vec() }, tensors)? {
-                    (Answer::Outputs, outputs) if outputs.len() == wanted.len() => Ok(outputs),
+                match worker.ask(&Question::Run { names, wanted: requested.to_vec() }, tensors)? {
+                    (Answer::Outputs, outputs) if outputs.len() == requested.len() => Ok(outputs),
                     other => Err(unexpected(&other.0)),
                 }
             }
-            Self::Here { model, .. } => model.as_mut().ok_or("no model is open")?.run(given, wanted),
+            Self::Here { model, .. } => model.as_mut().ok_or("no model is open")?.run(given, requested),
         }
     }
 

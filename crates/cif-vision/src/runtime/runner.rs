@@ -47,14 +47,14 @@ impl Runner {
         [self.model.inputs(), self.model.outputs()].map(|side| side.iter().map(declared).collect())
     }
 
-    /// The wanted outputs for some inputs.
+    /// The requested outputs for some inputs.
     ///
     /// # Errors
     /// When the model fails, in the words of the runtime.
     pub(super) fn run(
         &mut self,
         given: Vec<(String, Tensor)>,
-        wanted: &[String],
+        requested: &[String],
     ) -> Result<Vec<Tensor>, String> {
         let [declared, _] = self.declared();
         let run = || -> ort::Result<Vec<Tensor>> {
@@ -65,8 +65,8 @@ impl Runner {
                 inputs.push((name, value(element, tensor)?));
             }
             let answers = self.model.run(inputs)?;
-            let mut outputs = Vec::with_capacity(wanted.len());
-            for name in wanted {
+            let mut outputs = Vec::with_capacity(requested.len());
+            for name in requested {
                 let (shape, values) = answers[name.as_str()].try_extract_tensor::<f32>()?;
                 let shape: Vec<usize> =
                     shape.iter().map(|length| usize::try_from(*length).unwrap_or(0)).collect();

@@ -91,9 +91,9 @@ pub(super) fn bind(file: &Path, side: Side<'_>) -> Result<Bound, Error> {
             return refuse(format!("{file} has no {word} `{name}`, which {MANIFEST} names for `{part}`"));
         };
         if tensor.element == Element::Other || (word == "output" && tensor.element != Element::Float) {
-            let wanted = if word == "output" { "f32" } else { "f32, i64, i32 or bool" };
+            let expected = if word == "output" { "f32" } else { "f32, i64, i32 or bool" };
             return refuse(format!(
-                "the {word} `{name}` of {file} is of type {}, where {wanted} is expected",
+                "the {word} `{name}` of {file} is of type {}, where {expected} is expected",
                 tensor.type_name
             ));
         }

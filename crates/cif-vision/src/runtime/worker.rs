@@ -15,7 +15,7 @@ const LIBRARY_TIME: Duration = Duration::from_secs(60);
 
 type Message = io::Result<(Answer, Vec<Tensor>)>;
 
-/// Such a process, and the way to it.
+/// Such a process, and the channels to it.
 #[derive(Debug)]
 pub(super) struct Worker {
     child: Child,

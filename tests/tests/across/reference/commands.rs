@@ -70,8 +70,8 @@ fn write_arguments(page: &mut String, command: &Command, is_root: bool) {
             && (is_root || !arg.is_global_set())
     };
     for arg in command.get_arguments().filter(shown) {
-        let usual = if arg.is_positional() { "Arguments" } else { "Options" };
-        let heading = arg.get_help_heading().unwrap_or(usual);
+        let default = if arg.is_positional() { "Arguments" } else { "Options" };
+        let heading = arg.get_help_heading().unwrap_or(default);
         match groups.iter_mut().find(|(name, _)| *name == heading) {
             Some((_, args)) => args.push(arg),
             None => groups.push((heading, vec![arg])),
@@ -79,7 +79,7 @@ fn write_arguments(page: &mut String, command: &Command, is_root: bool) {
     }
     // As in the help: arguments, options, then headings of their own.
     groups.sort_by_key(|(heading, _)| {
-        ["Arguments", "Options"].iter().position(|usual| usual == heading).unwrap_or(2)
+        ["Arguments", "Options"].iter().position(|default| default == heading).unwrap_or(2)
     });
     for (heading, args) in groups {
         write!(page, "\n{heading}:\n\n").unwrap();

@@ -63,7 +63,7 @@ fn variables_are_read_through_the_table_alone() {
         .filter(|(_, text)| CALLS.iter().any(|call| text.contains(&format!("env::{call}("))))
         .map(|(name, _)| name)
         .filter(|name| !HANDED_TO_CHILDREN.contains(&name.as_str()))
-        // Cargo tells a build script by variables where it writes.
+        // Cargo gives a build script its output folder in variables.
         .filter(|name| !name.ends_with("/build.rs"))
         .collect();
     assert_eq!(readers, BTreeSet::from(["crates/cif-system/src/environment.rs".to_owned()]));

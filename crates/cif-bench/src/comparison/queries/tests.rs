@@ -77,7 +77,7 @@ fn the_best_are_marked_among_answers_by_the_same_rule() {
 }
 
 #[test]
-fn published_numbers_stand_beside_answers_with_a_detector() {
+fn published_numbers_stand_next_to_answers_with_a_detector() {
     let mut queries = queries();
     queries.answers.push(answer("table", "cif", 0, "red, \"round\" ball", Rule::Grouping, Some((1.0, 1.0))));
     let tables = queries.tables();

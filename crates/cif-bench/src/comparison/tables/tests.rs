@@ -94,7 +94,7 @@ fn every_form_has_every_run() {
 }
 
 #[test]
-fn what_is_missing_is_told_in_the_tables_that_lack_it() {
+fn what_is_missing_is_stated_in_the_tables_that_lack_it() {
     let (rows, names) = (rows(), ["cif", "vlgs"].map(str::to_owned));
     let missing =
         |capture: &str, head: &str, seed| Missing { capture: capture.into(), head: head.into(), seed };

@@ -189,11 +189,11 @@ pub(crate) fn named_cameras(folder: &Path) -> Result<(Vec<(String, DraftCamera)>
     Ok((cameras.collect::<Result<_, _>>()?, reconstruction.points))
 }
 
-/// The customary points of a capture, else those of the reconstruction beside it, whose damage is a warning.
+/// The customary points of a capture, else those of the reconstruction next to it, whose damage is a warning.
 ///
 /// # Errors
 /// When the file of customary points is damaged.
-pub(super) fn points_beside(
+pub(super) fn points_next_to(
     root: &Path,
     frames: &[DraftFrame],
     notes: &mut Vec<String>,
@@ -220,8 +220,8 @@ const FITTING_ANGLE: f64 = 0.0175;
 /// Fewest cameras that a similarity is fitted to: two leave a turn open, three check themselves.
 const FEWEST: usize = 4;
 
-/// Points of the reconstruction beside a capture, in its coordinates: where its cameras stand where those of the frames do,
-/// as they are, else by the similarity that brings the cameras together, which `notes` tell. Images belong to frames by
+/// Points of the reconstruction next to a capture, in its coordinates: where its cameras stand where those of the frames do,
+/// as they are, else by the similarity that brings the cameras together, which `notes` state. Images belong to frames by
 /// the stems of their names.
 ///
 /// # Errors

@@ -1,4 +1,4 @@
-//! A reconstruction as its files tell it.
+//! A reconstruction as its files give it.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -21,7 +21,7 @@ pub(super) struct Image {
     pub(super) camera: u32,
 }
 
-/// A reconstruction as its three files tell it.
+/// A reconstruction as its three files give it.
 pub(super) struct Reconstruction {
     pub(super) cameras: BTreeMap<u32, Camera>,
     pub(super) cameras_path: PathBuf,

@@ -1,5 +1,5 @@
 //! NumPy arrays of ids: a file per frame (`[height, width]`), or one for all (`[frames, height, width]`). Grounded SAM 2
-//! writes them in `mask_data`, and the classes of ids in JSON files of the same names in `json_data` beside it.
+//! writes them in `mask_data`, and the classes of ids in JSON files of the same names in `json_data` next to it.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -84,7 +84,7 @@ struct Class {
     class_name: String,
 }
 
-/// Adds the classes that are told of the ids of an array, where they are; the first of an id counts.
+/// Adds the classes that are given for the ids of an array, where they are; the first of an id counts.
 fn add_classes(array: &Path, classes: &mut BTreeMap<u16, String>) -> Result<(), Error> {
     let Some(folder) = array.parent().filter(|folder| folder.ends_with("mask_data")) else { return Ok(()) };
     let path = folder.with_file_name("json_data").join(format!("{}.json", listing::stem(array)));

@@ -1,6 +1,6 @@
 //! COCO JSON: annotations of objects with run-length codes or polygons.
 //!
-//! Objects are told apart by `track_id` (or `instance_id`, also in `attributes`, as CVAT writes them); without, the
+//! Objects are distinguished by `track_id` (or `instance_id`, also in `attributes`, as CVAT writes them); without, the
 //! category is the object, of which a picture then may have one.
 
 use std::collections::{BTreeMap, BTreeSet};

@@ -1,6 +1,6 @@
 //! XML of CVAT 1.1: pictures with polygons and masks, and videos with tracks of them.
 //!
-//! In pictures, objects are told apart by the attribute `track_id`, which CVAT adds for tracks; without, the label is
+//! In pictures, objects are distinguished by the attribute `track_id`, which CVAT adds for tracks; without, the label is
 //! the object. Tracks of videos are objects, and frames have the numbers of the video; a task may take every `step`th of
 //! them from `start_frame` on. Source: the XML annotation format of CVAT, version 1.1.
 

@@ -156,7 +156,7 @@ fn of_folder(source: &Path, frames: &FrameNames) -> Result<SourceKind, Error> {
         return Ok(kind);
     }
     match files::order_of(&names, frames).map_err(invalid)? {
-        // A name that all pictures begin with is that of the video, where values may tell objects apart; so is a folder of
+        // A name that all pictures begin with is that of the video, where values may distinguish objects; so is a folder of
         // theirs, and a word behind all frames, where they do.
         Some(order)
             if kind == SourceKind::Tracker

@@ -1,5 +1,5 @@
 //! JSON export of Label Studio: brushes and polygons per task. The label is the object: regions of one label in a picture
-//! are one object, because the export does not tell which region of another picture is the same thing.
+//! are one object, because the export does not say which region of another picture is the same thing.
 
 use std::path::Path;
 

@@ -88,15 +88,15 @@ pub(super) fn decode(matte: &Matte) -> Result<PixelGrid<bool>, Error> {
     let mut planes = Vec::new();
     for channel in Headers::read(path)?.decode()?.channels() {
         let name = full_name(channel.part.as_deref(), &channel.name);
-        if matte.channel.as_ref().is_some_and(|wanted| *wanted != name) {
+        if matte.channel.as_ref().is_some_and(|requested| *requested != name) {
             continue;
         }
         let last = name.rsplit('.').next().unwrap_or_default().to_lowercase();
         planes.push((last, channel.plane(samples(channel.samples), false)));
     }
-    if let Some(wanted) = &matte.channel {
+    if let Some(requested) = &matte.channel {
         let (_, plane) =
-            planes.pop().ok_or_else(|| Error::mask(path, format!("its channel {wanted} is missing")))?;
+            planes.pop().ok_or_else(|| Error::mask(path, format!("its channel {requested} is missing")))?;
         return Ok(plane);
     }
     single(planes).ok_or_else(|| Error::mask(path, "it has no channel; export it again"))

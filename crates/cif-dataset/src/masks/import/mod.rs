@@ -61,7 +61,7 @@ impl Import {
     /// the first frame of the video, where names end in numbers of its frames and nothing else shows it.
     ///
     /// # Errors
-    /// When nothing tells what the source is, it is damaged, no picture belongs to a frame, or two belong to one.
+    /// When nothing shows what the source is, it is damaged, no picture belongs to a frame, or two belong to one.
     pub fn open(
         source: &Path,
         kind: Option<SourceKind>,

@@ -58,8 +58,8 @@ fn columns_become_rows_and_runs_must_fill_the_picture() {
     let code = runs::Code::Columns(vec![1, 3, 2]);
     assert_eq!(runs_covered(&code, (3, 2)).unwrap(), [1, 3, 4]);
     for counts in [vec![1, 3], vec![1, 3, 3], vec![u64::MAX, 2]] {
-        let told = runs_covered(&runs::Code::Columns(counts), (3, 2)).unwrap_err();
-        assert!(told.contains("broken run-length code"), "{told}");
+        let message = runs_covered(&runs::Code::Columns(counts), (3, 2)).unwrap_err();
+        assert!(message.contains("broken run-length code"), "{message}");
     }
     let boxed = |left| runs::Code::Box { left, top: 1, width: 2, height: 1, counts: vec![1, 1] };
     assert_eq!(runs_covered(&boxed(1), (3, 2)).unwrap(), [5]);

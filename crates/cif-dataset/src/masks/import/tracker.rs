@@ -149,7 +149,7 @@ fn colors(
         listing.notes.push(format!("{thin} colours are nowhere 2 x 2 pixels large: are edges blended?"));
     }
     let mut objects = BTreeMap::new();
-    let mut told = Vec::new();
+    let mut ids_of_colors = Vec::new();
     for color in order.into_iter().filter(|color| *color != [0; 3]) {
         let [r, g, b] = color;
         let name = format!("#{r:02x}{g:02x}{b:02x}");
@@ -160,12 +160,12 @@ fn colors(
             .enter(&name, category.as_deref())
             .map_err(|problem| predictions.error(problem))?;
         objects.insert(color, object);
-        told.push(format!("{name} is {}", object + 1));
+        ids_of_colors.push(format!("{name} is {}", object + 1));
         if category.is_none() {
             listing.objects.name(object, &crate::instances::default_label(object as u16 + 1));
         }
     }
-    listing.notes.push(format!("colours as ids: {}", told.join(", ")));
+    listing.notes.push(format!("colours as ids: {}", ids_of_colors.join(", ")));
     Ok(Table::Colors(objects))
 }
 

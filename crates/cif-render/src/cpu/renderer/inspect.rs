@@ -153,7 +153,7 @@ impl Inspection {
     pub(super) fn look_at_deformation_gradients(&mut self, gradients: &Gradients) {
         if self.on {
             let moved = [PLANES, MLP, MEANS];
-            let of = |wanted| gradients.tensors().into_iter().find(|(parameter, _)| *parameter == wanted);
+            let of = |target| gradients.tensors().into_iter().find(|(parameter, _)| *parameter == target);
             let tensors: Vec<Tensor<'_>> = moved.into_iter().filter_map(of).collect();
             self.look_at_tensors("deform backward", "gradient of ", &tensors);
         }

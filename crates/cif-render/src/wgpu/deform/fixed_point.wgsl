@@ -1,6 +1,6 @@
 // Sums in 64-bit fixed point, which come out the same in any order: two 32-bit atomics, the lower one with carry. The
 // lower half starts in the middle of its range, so that small sums of either sign carry nothing over. One unit is
-// 2^-50, far below what Adam (epsilon 1e-15) tells from zero; sums reach up to 2^13.
+// 2^-50, far below what Adam (epsilon 1e-15) distinguishes from zero; sums reach up to 2^13.
 //
 // The module declares `sums: array<atomic<u32>>`, two per sum, and `faults: array<atomic<u32>>`.
 

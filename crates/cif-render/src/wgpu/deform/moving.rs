@@ -136,8 +136,8 @@ impl MovingRows {
             (&self.geometry, source.geometry.buffer(), target.geometry.buffer(), GEOMETRY_FLOATS, true),
             (&self.sh, source.sh.buffer(), target.sh.buffer(), SH_FLOATS, !self.canonical.sh.is_empty()),
         ];
-        for (uniform, source, target, width, wanted) in pairs {
-            if wanted {
+        for (uniform, source, target, width, needed) in pairs {
+            if needed {
                 let faults = self.no_faults.buffer();
                 let copied = CopiedRows { source, target, v_posed: nothing, faults };
                 let group = self.bind(gpu, kernel, uniform, &copied);

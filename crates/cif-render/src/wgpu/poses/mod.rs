@@ -289,7 +289,7 @@ impl GpuPoses {
         PosedInput { geometry: &posed.geometry, turns: Some(&self.turns), ..moved }
     }
 
-    /// Kind and base of a joint that the device holds poses to: one whose base rests, or has poses at the same times.
+    /// Kind and base of a joint that the device holds poses to: one whose base is at rest, or has poses at the same times.
     fn joint(&self, group: &TrackGroup) -> [u32; 4] {
         let Some(joint) = group.joint else { return [0; 4] };
         let base = &self.groups[joint.base as usize];

@@ -1,5 +1,5 @@
 // Groups of Gaussians that move as a whole, at the time of a view: `frames_of_groups` finds where every group is, between
-// two of its poses, `carry` puts its Gaussians there and tells how their frame is turned. Rust twin: cif_field::tracks,
+// two of its poses, `carry` puts its Gaussians there and gives the rotation of their frame. Rust twin: cif_field::tracks,
 // `TracksAtTime::apply`. Source: methods reference of motion, 2.2.
 
 #import constants

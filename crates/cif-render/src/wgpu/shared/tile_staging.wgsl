@@ -48,7 +48,7 @@ fn stage_tile(first: u32, end: u32, tile: vec2u, open: vec4u, local: u32) -> u32
     }
     workgroupBarrier();
     atomicOr(&live, open.x | (open.y << 2u) | (open.z << 4u) | (open.w << 6u));
-    // An invocation tells one quadrant of an entry.
+    // An invocation decides one quadrant of an entry.
     let place = local / 4u;
     let quadrant = local % 4u;
     if (first + place < end) {

@@ -16,7 +16,7 @@ use crate::config::{Excess, LabelShares, ResampleConfig, ScaleCorrection, WeakSe
 use crate::density::rearrangement::in_world;
 use crate::estimate::most_probable;
 
-/// Inputs of a resampling event beside the field.
+/// Inputs of a resampling event in addition to the field.
 #[derive(Clone, Copy, Debug)]
 pub struct ResampleContext<'a> {
     /// Settings.

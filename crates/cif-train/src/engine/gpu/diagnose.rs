@@ -13,7 +13,7 @@ use crate::wgpu::kernels::fault_name;
 
 impl GpuEngine {
     /// The fault of a step that the device refused, whose parameters are not counted any more: the step is repeated
-    /// on the processor, with every array looked at. What goes wrong on the device alone is told by the group whose
+    /// on the processor, with every array looked at. What goes wrong on the device alone is identified by the group whose
     /// gradient it was.
     pub(super) fn diagnose(
         &mut self,

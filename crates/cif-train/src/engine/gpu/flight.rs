@@ -98,7 +98,7 @@ impl Flights {
         self.waiting.push_back(flight);
     }
 
-    /// The oldest step, once all of it has arrived. Waits for that step, and no other, when `all` are wanted or the
+    /// The oldest step, once all of it has arrived. Waits for that step, and no other, when `all` are needed or the
     /// host is far ahead.
     pub(super) fn next(
         &mut self,

@@ -57,9 +57,9 @@ pub(crate) struct GpuEngine {
     pub(super) of_head: Option<StepReport>,
     /// Steps behind one that must not be taken, to be recorded again.
     pub(super) again: Vec<Recording>,
-    /// Most pairs and label slots that a view wanted so far, and of how many Gaussians.
-    pub(super) wanted: [usize; 2],
-    pub(super) wanted_of: usize,
+    /// Most pairs and label slots that a view needed so far, and of how many Gaussians.
+    pub(super) needed: [usize; 2],
+    pub(super) needed_of: usize,
     /// True when the device is ahead of the host.
     pub(super) ahead: bool,
     /// Steps since the host's state was fetched.
@@ -170,8 +170,8 @@ impl GpuEngine {
             flights: Flights::default(),
             of_head: None,
             again: Vec::new(),
-            wanted: [SMALLEST_ROOM; 2],
-            wanted_of: 0,
+            needed: [SMALLEST_ROOM; 2],
+            needed_of: 0,
             ahead: false,
             since_fetch: 0,
             fetched: None,

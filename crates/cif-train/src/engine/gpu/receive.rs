@@ -71,24 +71,24 @@ impl GpuEngine {
         Ok(())
     }
 
-    /// Remembers the most that a view wanted.
+    /// Remembers the most that a view needed.
     fn learn(&mut self, views: &[ViewResult]) {
         for view in views {
-            let wanted = [view.counts.wanted_pairs, view.counts.wanted_slots];
-            self.wanted = [0, 1].map(|k| self.wanted[k].max(wanted[k] as usize));
+            let needed = [view.counts.wanted_pairs, view.counts.wanted_slots];
+            self.needed = [0, 1].map(|k| self.needed[k].max(needed[k] as usize));
         }
     }
 
-    /// Room for what views have wanted, grown with the set, and a quarter more where the device has it: what is
+    /// Room for what views have needed, grown with the set, and a quarter more where the device has it: what is
     /// reserved has half as much on top, so that few views have to be drawn again.
     pub(super) fn make_room(&mut self, gaussians: usize) -> Result<(), GpuError> {
-        if gaussians > self.wanted_of && self.wanted_of > 0 {
-            let grown = |wanted: usize| (wanted as f64 * gaussians as f64 / self.wanted_of as f64) as usize;
-            self.wanted = self.wanted.map(grown);
+        if gaussians > self.needed_of && self.needed_of > 0 {
+            let grown = |needed: usize| (needed as f64 * gaussians as f64 / self.needed_of as f64) as usize;
+            self.needed = self.needed.map(grown);
         }
-        self.wanted_of = self.wanted_of.max(gaussians);
+        self.needed_of = self.needed_of.max(gaussians);
         let most = Rasterizer::most_pairs(&self.gpu);
-        let [pairs, slots] = self.wanted;
+        let [pairs, slots] = self.needed;
         let roomy = (pairs + pairs / 4).min(most).max(pairs);
         self.rasterizer.reserve(&self.gpu, roomy, slots + slots / 4)
     }

@@ -34,9 +34,9 @@ impl GpuEngine {
         poses.groups.gradients.write(&self.gpu, 0, &[sum]);
     }
 
-    /// Pairs and label slots that views wanted so far.
-    pub(crate) fn wanted(&mut self) -> &mut [usize; 2] {
-        &mut self.wanted
+    /// Pairs and label slots that views needed so far.
+    pub(crate) fn needed(&mut self) -> &mut [usize; 2] {
+        &mut self.needed
     }
 
     /// Makes the run fetch the state behind the next step.

@@ -7,7 +7,7 @@
 //! absolute difference from the map of the frame, where pixels without a feature count as agreeing, times 0.2.
 //! A question is answered by [`relevance`].
 //!
-//! It tells no instances apart: rows, labels and their scores do not exist for it.
+//! It distinguishes no instances: rows, labels and their scores do not exist for it.
 //!
 //! Deviations: the maps are given, one granularity of them (the published method makes maps at three
 //! granularities of embeddings of masks, 512 numbers compressed to three by an autoencoder, and answers by the

@@ -26,7 +26,7 @@ const LAYERS: usize = WIDTHS.len() - 1;
 /// Places that are evaluated together.
 const CHUNK: usize = 128;
 
-/// Most places whose layers are kept for the way back, which takes 840 values each.
+/// Most places whose layers are kept for the backward pass, which takes 840 values each.
 const KEPT: usize = 1 << 16;
 
 /// Most tasks of a backward pass, each with gradients of its own; fixed, so that sums do not depend on threads.

@@ -69,7 +69,7 @@ impl Parts {
     }
 }
 
-/// Parameters at the start: uniform, as linear layers usually start.
+/// Parameters at the start: uniform, as linear layers start by default.
 pub(super) fn start(seed: u64) -> Vec<f32> {
     let mut random = stream(seed, Purpose::HeadNetwork, 0);
     let root = 1.0 / (WIDTH as f32).sqrt();

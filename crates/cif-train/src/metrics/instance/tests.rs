@@ -120,7 +120,7 @@ fn small_instances_are_not_watched_for_switches() {
 
 #[test]
 fn swapped_twins_lower_tubes_though_every_frame_has_both() {
-    // Two twins swap ids half way: per-pixel accuracy 50, association quality tells the tubes are mixed.
+    // Two twins swap ids half way: per-pixel accuracy 50, association quality shows that the tubes are mixed.
     let frames = [frame("a", 0, &[(1, 1, 200), (2, 2, 200)]), frame("a", 1, &[(1, 2, 200), (2, 1, 200)])];
     let metrics = instance_metrics(&frames);
     close(metrics.macc_pix, 50.0);

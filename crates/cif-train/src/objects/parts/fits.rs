@@ -176,10 +176,10 @@ impl<'a> Search<'a> {
         let start = *body.values.values().next()?;
         let members = body.part_rows();
         let g = body.shape.gaussians();
-        let kept = |wanted: bool| {
+        let kept = |of_part: bool| {
             let mut own = g.clone();
-            let is_wanted = |row: usize| members[row] == wanted && g.opacity_logits[row] > SEEN;
-            own.retain(&(0..g.len()).map(is_wanted).collect::<Vec<_>>());
+            let is_selected = |row: usize| members[row] == of_part && g.opacity_logits[row] > SEEN;
+            own.retain(&(0..g.len()).map(is_selected).collect::<Vec<_>>());
             own
         };
         let mut part = kept(true);
@@ -204,7 +204,7 @@ impl<'a> Search<'a> {
     }
 }
 
-/// An object that rests and a part of it that moves, in the world.
+/// An object at rest and a part of it that moves, in the world.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) struct Jointed {
     #[serde(skip)]

@@ -44,7 +44,7 @@ use super::split::{SplitViews, times_of};
 use super::view::meeting_point;
 use crate::error::TrainError;
 
-/// Reliable times below which parts cannot be told apart.
+/// Reliable times below which parts cannot be distinguished.
 const FEWEST_TIMES: usize = 8;
 
 /// Gaussians and steps of the static body that guesses are cut from.
@@ -89,8 +89,8 @@ pub(super) fn turning_ball(object: Object<'_>) -> Result<Option<Jointed>, TrainE
     phases.check()?;
     let Some((Turning { axis, angles }, errors)) = turning(shown(), &ball) else { return Ok(None) };
     phases.check()?;
-    let rests = Pose { rotation: DQuat::IDENTITY, translation: ball.centre };
-    let base: BTreeMap<usize, Pose> = object.views.iter().map(|view| (view.time_index, rests)).collect();
+    let at_rest = Pose { rotation: DQuat::IDENTITY, translation: ball.centre };
+    let base: BTreeMap<usize, Pose> = object.views.iter().map(|view| (view.time_index, at_rest)).collect();
     let is_shown = |view: &usize| !object.views[*view].is_sliver();
     let views = (0..object.views.len()).filter(is_shown).collect();
     let search = Search::new(object, &base, SplitViews::whole(views));
@@ -116,7 +116,7 @@ pub(super) fn turning_ball(object: Object<'_>) -> Result<Option<Jointed>, TrainE
     Ok(Some(found.moved(ball.centre)))
 }
 
-/// Looks for a part on a joint of an object that rests otherwise.
+/// Looks for a part on a joint of an object that is otherwise at rest.
 ///
 /// # Errors
 /// [`TrainError::Stopped`] when the run is to stop.
@@ -124,8 +124,8 @@ pub(super) fn find(object: Object<'_>) -> Result<Option<Jointed>, TrainError> {
     let views = object.views;
     let rays = views.iter().map(|view| (view, view.visible.powi(2)));
     let Some(place) = meeting_point(rays) else { return Ok(None) };
-    let rests = Pose { rotation: DQuat::IDENTITY, translation: place };
-    let base: BTreeMap<usize, Pose> = views.iter().map(|view| (view.time_index, rests)).collect();
+    let at_rest = Pose { rotation: DQuat::IDENTITY, translation: place };
+    let base: BTreeMap<usize, Pose> = views.iter().map(|view| (view.time_index, at_rest)).collect();
     Ok(find_on(object, &base)?.map(|found| found.moved(place)))
 }
 

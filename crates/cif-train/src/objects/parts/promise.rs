@@ -15,7 +15,7 @@ use super::search::search;
 /// Times that guesses are searched at, one view each.
 pub(super) const LOOKS: usize = 12;
 
-/// Places that the box is looked for among, of these the fewest that tell it, and the share of views that may have
+/// Places that the box is looked for among, of these the fewest that determine it, and the share of views that may have
 /// them beside the mask.
 const CANDIDATES: usize = 8000;
 const FEWEST_INSIDE: usize = 50;
@@ -75,7 +75,7 @@ impl<'a> Search<'a> {
             return Vec::new();
         }
         if self.one_camera {
-            // The hull of few directions hardly tells how the box is turned.
+            // The hull of few directions hardly shows how the box is turned.
             for degrees in TURNS {
                 tried.extend(try_all(&sides.turned(degrees.to_radians(), inside)));
             }

@@ -125,8 +125,8 @@ impl<'a> Search<'a> {
             of.entry(self.object.views[*view].time_index).or_default().push(*view);
         }
         let all = of.len();
-        let wanted = count.min(all).max(2);
-        let kept: Vec<usize> = (0..wanted).map(|k| k * (all - 1) / (wanted - 1)).collect();
+        let needed = count.min(all).max(2);
+        let kept: Vec<usize> = (0..needed).map(|k| k * (all - 1) / (needed - 1)).collect();
         let mut times: BTreeMap<usize, Vec<usize>> = of
             .into_iter()
             .enumerate()
@@ -134,14 +134,14 @@ impl<'a> Search<'a> {
             .map(|(_, of_time)| of_time)
             .collect();
         for (k, views) in times.values_mut().enumerate() {
-            let wanted = if count < all { 1 } else { VIEWS.min(views.len()) };
-            *views = (0..wanted).map(|view| views[(k + view * views.len() / wanted) % views.len()]).collect();
+            let needed = if count < all { 1 } else { VIEWS.min(views.len()) };
+            *views = (0..needed).map(|view| views[(k + view * views.len() / needed) % views.len()]).collect();
         }
         times
     }
 
     /// True for places that what the object stands on leaves room for and that, where one camera sees it at a time and
-    /// does not tell how deep it is, are not farther away from its middle than it is wide.
+    /// does not show how deep it is, are not farther away from its middle than it is wide.
     pub(super) fn is_within(&self, place: DVec3) -> bool {
         let Some((plane, up)) = self.object.surroundings.plane.zip(self.up) else { return true };
         let Some(pose) = self.base.values().next() else { return true };

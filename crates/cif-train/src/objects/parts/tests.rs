@@ -32,7 +32,7 @@ fn faces(low: DVec3, high: DVec3, count: usize, seed: u64) -> Vec<DVec3> {
         .collect()
 }
 
-/// Share of the way at a time: it rests, goes, and rests.
+/// Share of the way at a time: it stands, goes, and stands.
 fn share(time: usize) -> f64 {
     let share = ((time as f64 / (TIMES - 1) as f64 - 0.2) / 0.6).clamp(0.0, 1.0);
     share * share * (3.0 - 2.0 * share)
@@ -46,7 +46,7 @@ fn seen(
     cameras: Cameras,
 ) -> Vec<ObjectView> {
     let mut views = seen_always(base, part, pose, cameras);
-    // Half of the times tell enough.
+    // Half of the times show enough.
     views.retain(|view| view.time_index.is_multiple_of(2));
     views
 }
@@ -122,7 +122,7 @@ fn a_drawer_slides() {
 
 #[test]
 #[ignore = "long: make test-long"]
-fn a_box_that_rests_has_no_part() {
+fn a_box_at_rest_has_no_part() {
     let places = faces(DVec3::new(-0.07, -0.05, 0.0), DVec3::new(0.07, 0.05, 0.08), 1500, 24);
     let (base, rest) = places.split_at(1000);
     for cameras in [moving as Cameras, rig] {
@@ -176,7 +176,7 @@ fn a_globe_turns_on_its_stand() {
 }
 
 #[test]
-fn a_globe_that_rests_or_is_plain_is_not_seen_to_turn() {
+fn a_globe_that_is_at_rest_or_plain_is_not_seen_to_turn() {
     for (degrees, color) in [(0.0, patches as fn(DVec3) -> [f32; 3]), (160.0, |_| [0.7, 0.5, 0.3])] {
         for cameras in [moving as Cameras, rig] {
             assert!(turning(&globe(DVec3::Z, degrees, color, cameras)).is_none());

@@ -16,8 +16,8 @@ const LUMINANCE: DVec3 = DVec3::new(0.299, 0.587, 0.114);
 /// Pixels of a mask from which those at its outline, which mix with what is behind, are left out.
 const ERODED: usize = 150;
 
-/// Pixels of a usual mask beyond which images are reduced, and most pixels of all views together: more pixels cost time
-/// and do not change verdicts.
+/// Median area of masks, pixels, beyond which images are reduced, and most pixels of all views together: more pixels cost
+/// time and do not change verdicts.
 const LARGE: f64 = 1600.0;
 const MOST: usize = 60_000;
 

@@ -184,7 +184,7 @@ impl Hull {
     }
 
     /// The largest solid of revolution about an axis of this direction inside the hull, and a point of the axis. How deep it
-    /// lies outlines from one side hardly tell: it touches what it lies on.
+    /// lies outlines from one side hardly show: it touches what it lies on.
     pub(super) fn revolved(&self, axis: DVec3, contact: Option<&Contact>) -> Option<(Self, DVec3)> {
         let mut best = self.middle().map(|middle| (self.rings(axis, middle), middle))?;
         let (first, second) = axis.any_orthonormal_pair();
@@ -354,11 +354,12 @@ fn smoothed(grid: &Grid, inside: &[bool]) -> Vec<f32> {
                 *value = field[start + k * stride];
             }
             for k in 0..dim {
-                let beside = |distance: usize| {
+                let neighbours = |distance: usize| {
                     let before = k.checked_sub(distance).map_or(0.0, |k| line[k]);
                     before + line.get(k + distance).copied().unwrap_or(0.0)
                 };
-                let sum: f32 = (1..KERNEL.len()).map(|distance| KERNEL[distance] * beside(distance)).sum();
+                let sum: f32 =
+                    (1..KERNEL.len()).map(|distance| KERNEL[distance] * neighbours(distance)).sum();
                 field[start + k * stride] = KERNEL[0] * line[k] + sum;
             }
         }

@@ -1,5 +1,5 @@
 //! The judge of rotations: which of several hypotheses about the turns of an object on a known path explains its pixels,
-//! and whether the pixels tell. Source: motion reference, second part, 5.
+//! and whether the pixels decide. Source: motion reference, second part, 5.
 //!
 //! Light stays where it is while a surface turns, so that colours fixed to an object argue against every rotation of it.
 //! Two models take light out, and are fitted to all pixels but those of a block of times, on which they are judged:

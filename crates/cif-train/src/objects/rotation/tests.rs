@@ -90,7 +90,7 @@ fn a_plain_ball_shows_no_turn() {
 }
 
 #[test]
-fn shading_of_a_plain_ball_that_rolls_is_told_from_a_turn() {
+fn shading_of_a_plain_ball_that_rolls_is_distinguished_from_a_turn() {
     let place = |time: usize| DVec3::new(0.3 * share(time) - 0.15, 0.0, RADIUS);
     let rolls = |degrees: f64| course(degrees, DVec3::Y, place);
     let whole = (0.3 / RADIUS).to_degrees();

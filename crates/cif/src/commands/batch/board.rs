@@ -94,14 +94,14 @@ impl<'a> Board<'a> {
     }
 
     /// A job will not run now.
-    pub(super) fn rests(&mut self, job: usize) {
+    pub(super) fn pauses(&mut self, job: usize) {
         if let Some((bar, _)) = self.running.remove(&job) {
             bar.finish_and_clear();
         }
     }
 
     pub(super) fn ends(&mut self, job: usize, outcome: &Outcome) {
-        self.rests(job);
+        self.pauses(job);
         self.ended += 1;
         let id = &self.batch.jobs[job].id;
         let line = match outcome {

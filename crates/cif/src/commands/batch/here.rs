@@ -136,7 +136,7 @@ fn share_out(batch: &Batch, limits: Limits, inputs: &Inputs<'_>) -> Result<Ended
                 }
                 Ok((index, Err(error))) => {
                     schedule.put_aside(index);
-                    board.rests(index);
+                    board.pauses(index);
                     first_error.get_or_insert(error);
                 }
                 Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => board.refresh(limits.jobs),
@@ -164,12 +164,12 @@ fn take(
         Outcome::Failed(_) => ended.failed += 1,
         Outcome::Elsewhere => {
             schedule.put_aside(index);
-            board.rests(index);
+            board.pauses(index);
             return;
         }
         Outcome::Interrupted => {
             schedule.put_aside(index);
-            board.rests(index);
+            board.pauses(index);
             ended.interrupted = true;
             return;
         }

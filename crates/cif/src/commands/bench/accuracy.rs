@@ -150,9 +150,9 @@ fn prepare(command: &BenchAccuracy) -> Result<Prepared, Error> {
         base_config(command, layout).map(drop)
     };
     let layout = command.capture_options.layout_after(&command.capture, check)?;
-    let wanted = base_config(command, layout)?.downscale;
+    let configured = base_config(command, layout)?.downscale;
     let mut options = command.capture_options.clone();
-    options.downscale = options.downscale.or(wanted);
+    options.downscale = options.downscale.or(configured);
     let mut dataset = options.open(&command.capture)?;
     if command.quick
         && options.downscale.is_none()
@@ -546,7 +546,7 @@ impl Bench {
         Ok(Some(record))
     }
 
-    /// Measures a rung alone, beside others that other processes measure.
+    /// Measures a rung alone, while other processes measure others.
     fn part(&mut self, all: &[Ladder], only: &str) -> Result<(), Error> {
         let base = Rung { id: BASE.to_owned(), label: "the base".to_owned(), work: Work::Train(Vec::new()) };
         let mut rungs = all.iter().flat_map(|ladder| &ladder.rungs).chain([&base]);

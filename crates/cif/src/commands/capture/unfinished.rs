@@ -136,7 +136,7 @@ fn with_poses(command: &Capture, kept: &Unfinished) -> Vec<String> {
     words
 }
 
-/// Inputs, output and options that go with every way to poses.
+/// Inputs, output and options that go with every method for poses.
 fn beginning(command: &Capture, inputs: &[String], times: Option<&Path>) -> Vec<String> {
     let mut words = vec!["capture".to_owned()];
     words.extend(inputs.iter().cloned());

@@ -33,7 +33,7 @@ pub(super) fn put_into(folder: &Path) -> Result<PathBuf, Error> {
     put_files_into(FILES, folder)
 }
 
-/// Puts the trained scene beside the capture, unless it is there.
+/// Puts the trained scene next to the capture, unless it is there.
 ///
 /// # Errors
 /// When this build has none, another file has its place, or the file system refuses.

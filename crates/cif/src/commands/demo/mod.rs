@@ -132,7 +132,7 @@ impl Running<'_> {
         Ok(scene)
     }
 
-    /// The error of a run that was interrupted, with the way to go on with all of the demo.
+    /// The error of a run that was interrupted, with the command to go on with all of the demo.
     fn continued(&self, error: Error) -> Error {
         let Error::Interrupted { message, help: Some(_) } = error else { return error };
         let mut again = vec!["demo".to_owned()];

@@ -268,8 +268,8 @@ fn spread(cameras: &[RecordedCamera], count: usize) -> Vec<&RecordedCamera> {
     for turn in 0..sorted.len() {
         // One view of every time that has another, or of times between which others are left out.
         let round: Vec<&RecordedCamera> = by_time.iter().filter_map(|of| of.get(turn).copied()).collect();
-        let wanted = (count - chosen.len()).min(round.len());
-        chosen.extend((0..wanted).map(|k| round[(2 * k + 1) * round.len() / (2 * wanted)]));
+        let taken = (count - chosen.len()).min(round.len());
+        chosen.extend((0..taken).map(|k| round[(2 * k + 1) * round.len() / (2 * taken)]));
     }
     chosen.sort_by_key(|camera| camera.time_index);
     chosen
@@ -553,7 +553,7 @@ mod tests {
     }
 
     #[test]
-    fn what_loses_much_is_told_the_way_out() {
+    fn large_losses_come_with_advice() {
         assert!(advice(Some(0.31)).unwrap().contains("loses 0.31 dB: a smaller --tolerance"));
         assert!(advice(Some(0.1)).is_none() && advice(Some(-0.4)).is_none() && advice(None).is_none());
     }

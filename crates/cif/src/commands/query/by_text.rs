@@ -39,7 +39,7 @@ impl JsonReport for Ranking<'_> {
     const COMMANDS: &'static [&'static str] = &["cif query --text"];
 }
 
-pub(super) fn run(command: &Query, text: &str, wanted: ObjectQuery) -> Result<(), Error> {
+pub(super) fn run(command: &Query, text: &str, query: ObjectQuery) -> Result<(), Error> {
     if words(text).is_empty() {
         return Err(Error::usage(
             "--text has no words",
@@ -51,7 +51,7 @@ pub(super) fn run(command: &Query, text: &str, wanted: ObjectQuery) -> Result<()
     if let Some(models) = &models {
         models.embedder_name()?;
     }
-    let objects = search(command, wanted)?;
+    let objects = search(command, query)?;
     let has_embeddings = objects.iter().any(|object| object.embedding.is_some());
     let scored = match models {
         Some(models) if has_embeddings => by_meaning(&models, text, objects, &command.path)?,

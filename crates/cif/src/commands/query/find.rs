@@ -11,16 +11,16 @@ use crate::formats::Content;
 use crate::moment::{Frames, note_fraction};
 
 /// Objects of the file that meet every condition.
-pub(super) fn search(command: &Query, mut wanted: ObjectQuery) -> Result<Vec<ObjectMatch>, Error> {
+pub(super) fn search(command: &Query, mut query: ObjectQuery) -> Result<Vec<ObjectMatch>, Error> {
     match Content::of(&command.path)? {
-        Content::Field => in_scene(command, wanted),
+        Content::Field => in_scene(command, query),
         Content::Graph(format) => {
             let options = ReadOptions { follow_external: command.follow_external };
             if command.time.is_some() || command.interval.is_some() {
                 let range = format.code_range(&command.path, options).map_err(Error::plain)?;
-                wanted.when = when(command, &Frames::new(range, &command.path.display().to_string()))?;
+                query.when = when(command, &Frames::new(range, &command.path.display().to_string()))?;
             }
-            format.search(&command.path, &wanted, options).map_err(Error::plain)
+            format.search(&command.path, &query, options).map_err(Error::plain)
         }
     }
 }
@@ -93,13 +93,13 @@ fn corner(option: &str, numbers: &[f64]) -> Result<DVec3, Error> {
     }
 }
 
-fn in_scene(command: &Query, mut wanted: ObjectQuery) -> Result<Vec<ObjectMatch>, Error> {
+fn in_scene(command: &Query, mut query: ObjectQuery) -> Result<Vec<ObjectMatch>, Error> {
     let place = command.path.display().to_string();
     let field = scene::load(&command.path)?;
     let options = SceneOptions { proxy_points: 0, ..SceneOptions::default() };
     let graph = cif_scene::build(&field, &options).map_err(Error::plain)?;
-    wanted.when = when(command, &Frames::new(graph.time_codes.range(), &place))?;
-    cif_scene::search(&graph, &wanted, &place, |name| format!("/World/{name}")).map_err(Error::plain)
+    query.when = when(command, &Frames::new(graph.time_codes.range(), &place))?;
+    cif_scene::search(&graph, &query, &place, |name| format!("/World/{name}")).map_err(Error::plain)
 }
 
 /// Coordinates in tables.

@@ -74,12 +74,12 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
         ));
     }
     let is_field = matches!(Content::of(&command.path)?, Content::Field);
-    let wanted = question(command)?;
+    let query = question(command)?;
     if let Some(file) = &command.trajectory {
-        return trajectory::run(command, file, &wanted);
+        return trajectory::run(command, file, &query);
     }
-    if let (true, Some(place)) = (is_field, wanted.point) {
-        let others = wanted.label.is_some() || wanted.region.is_some();
+    if let (true, Some(place)) = (is_field, query.point) {
+        let others = query.label.is_some() || query.region.is_some();
         if others || command.interval.is_some() || command.text.is_some() {
             return Err(Error::usage(
                 "--point in a .cif asks the field itself, without other conditions than --time",
@@ -89,10 +89,10 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
         return at(command, place);
     }
     if let Some(text) = &command.text {
-        return by_text::run(command, text, wanted);
+        return by_text::run(command, text, query);
     }
     let place = command.path.display().to_string();
-    let found = search(command, wanted)?;
+    let found = search(command, query)?;
     command.report.give(
         || Matches(&found),
         || match found.as_slice() {

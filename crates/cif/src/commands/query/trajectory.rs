@@ -15,7 +15,7 @@ use crate::output::{self, Outputs};
 /// Columns of the table.
 const COLUMNS: &str = "object,label,class,frame,time,seconds,x,y,z,qw,qx,qy,qz,visible";
 
-pub(super) fn run(command: &Query, file: &Path, wanted: &ObjectQuery) -> Result<(), Error> {
+pub(super) fn run(command: &Query, file: &Path, query: &ObjectQuery) -> Result<(), Error> {
     let to_stdout = output::is_stdout(file);
     if !to_stdout {
         if file.extension().is_none_or(|ending| !ending.eq_ignore_ascii_case("csv")) {
@@ -29,7 +29,7 @@ pub(super) fn run(command: &Query, file: &Path, wanted: &ObjectQuery) -> Result<
         outputs.text(file)?;
     }
     let place = command.path.display().to_string();
-    let paths = trajectories(&graph(command)?, wanted, &place).map_err(Error::plain)?;
+    let paths = trajectories(&graph(command)?, query, &place).map_err(Error::plain)?;
     let table = csv(&paths);
     if to_stdout {
         print!("{table}");

@@ -185,7 +185,7 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     let field = scene::load(&command.scene)?;
     let place = command.scene.display().to_string();
     let time_of_all = command.time.map(|moment| scene::time(&field, &place, "--time", moment)).transpose()?;
-    let what = wanted_layers(command, &field)?;
+    let what = requested_layers(command, &field)?;
     check_look(command, &field)?;
     let mut outputs = Outputs::new(command.force);
     outputs.reads(&command.scene)?;
@@ -256,7 +256,7 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
 }
 
 /// The layers that are asked for, which the scene has.
-fn wanted_layers(command: &Render, field: &Field) -> Result<BTreeSet<What>, Error> {
+fn requested_layers(command: &Render, field: &Field) -> Result<BTreeSet<What>, Error> {
     let mut what: BTreeSet<What> = command.what.iter().copied().collect();
     if what.is_empty() && !command.exr {
         what.insert(What::Rgb);
@@ -320,7 +320,7 @@ fn check_look(command: &Render, field: &Field) -> Result<(), Error> {
     Ok(())
 }
 
-/// Notes how many views have the mean look although the recorded one is wanted.
+/// Notes how many views have the mean look although the recorded one is requested.
 fn note_mean_looks(field: &Field, views: &[Shot], time_of_all: Option<f64>) {
     let is_mean = |shot: &&Shot| {
         let time = time_of_all.or(shot.view.time).unwrap_or(0.0);

@@ -30,7 +30,7 @@ fn refuse_folder(path: &Path) -> Result<(), Error> {
     Ok(())
 }
 
-/// Loads a `.cif` file with the head that labels its pixels, where its identity rows do not; a head that tells
+/// Loads a `.cif` file with the head that labels its pixels, where its identity rows do not; a head that gives
 /// none is left out.
 ///
 /// # Errors

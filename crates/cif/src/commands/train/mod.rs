@@ -310,7 +310,7 @@ fn phases(timing: &Timing, progress: &Arc<Mutex<Progress>>, watch: Option<&Arc<W
     })
 }
 
-/// Opens the capture as its scene was trained, and triangulates points where they are wanted; the second is false where
+/// Opens the capture as its scene was trained, and triangulates points where they are needed; the second is false where
 /// none were found.
 fn open_capture(
     command: &Train,
@@ -323,25 +323,25 @@ fn open_capture(
         Origin::Capture => command.capture_options.clone(),
     };
     if !matches!(origin, Origin::State(_)) {
-        let wanted = resolve(command, origin.settings().as_ref(), layout, None)?.downscale;
-        capture.downscale = command.capture_options.downscale.or(wanted);
+        let configured = resolve(command, origin.settings().as_ref(), layout, None)?.downscale;
+        capture.downscale = command.capture_options.downscale.or(configured);
     }
     let phase = phases.enter(Phase::Open, 0);
     let mut dataset = capture.open(&command.capture)?;
     drop(phase);
     // A scene that is begun with has its Gaussians; a run that goes on has the points that it began with.
-    let is_wanted = match origin {
+    let is_needed = match origin {
         Origin::State(state) => training_config(&state.field),
         Origin::Scene(_) => None,
         Origin::Capture => Some(resolve(command, None, layout, None)?),
     }
     .is_some_and(|config| config.model.triangulate);
-    let has_points = !is_wanted || starting_points::find(&mut dataset, phases)?;
+    let has_points = !is_needed || starting_points::find(&mut dataset, phases)?;
     print_warnings(&dataset);
     Ok((dataset, has_points))
 }
 
-/// A trainer at its first step; `has_points` is false where points were wanted and could not be triangulated.
+/// A trainer at its first step; `has_points` is false where points were needed and could not be triangulated.
 fn begin(
     command: &Train,
     origin: Origin,

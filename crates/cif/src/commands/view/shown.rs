@@ -43,7 +43,7 @@ impl Shown {
 /// Opens whatever a path names.
 ///
 /// # Errors
-/// When it cannot be read, or a capture is given beside a capture.
+/// When it cannot be read, or a capture is given in addition to a capture.
 pub(super) fn open(path: &Path, capture: Option<&Path>, options: &CaptureOptions) -> Result<Shown, Error> {
     if path.is_dir() {
         if capture.is_some() {

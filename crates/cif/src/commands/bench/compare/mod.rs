@@ -121,7 +121,7 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
     Ok(())
 }
 
-/// Does one part alone, beside others that other processes do.
+/// Does one part alone, while other processes do others.
 fn part(
     command: &BenchCompare,
     captures: &[Capture],
@@ -219,12 +219,12 @@ fn contenders(command: &BenchCompare, has_maps: bool) -> Result<Vec<Contender>, 
             "name their folder in the file of --queries, see cif bench compare --help, or leave the head out",
         ));
     }
-    let wanted = |head: &HeadName| match command.heads.is_empty() {
+    let is_included = |head: &HeadName| match command.heads.is_empty() {
         true => head.tells_labels() || has_maps,
         false => is_named(*head),
     };
     let mut contenders: Vec<Contender> =
-        HeadName::ALL.iter().copied().filter(wanted).map(Contender::Head).collect();
+        HeadName::ALL.iter().copied().filter(is_included).map(Contender::Head).collect();
     if command.ablations {
         let whole = Contender::Head(HeadName::Cif);
         if !contenders.contains(&whole) {

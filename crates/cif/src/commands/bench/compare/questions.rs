@@ -318,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn mistakes_are_told_with_their_place() {
+    fn mistakes_are_reported_with_their_place() {
         let question = |text: &str, answer: &str| {
             format!("[[capture]]\nname = \"a\"\n[[capture.question]]\ntext = \"{text}\"\nanswer = {answer}\n")
         };

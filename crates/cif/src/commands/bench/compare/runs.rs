@@ -91,7 +91,7 @@ impl Bench {
     }
 
     /// True where a part is to be done.
-    fn is_wanted(&self, id: &str) -> bool {
+    fn is_requested(&self, id: &str) -> bool {
         self.only.as_ref().is_none_or(|only| only == id)
     }
 
@@ -106,7 +106,7 @@ impl Bench {
         }
         let inputs = self.inputs(subject, contenders);
         for contender in contenders {
-            if !self.is_wanted(&id(subject.capture, subject.config.seed, contender.name())) {
+            if !self.is_requested(&id(subject.capture, subject.config.seed, contender.name())) {
                 continue;
             }
             let Some(config) = self.settings(subject, *contender) else { continue };

@@ -250,9 +250,9 @@ impl Work<'_> {
         let painted: BTreeSet<usize> = self.painted.keys().map(|frame| moment(*frame)).collect();
         let at_painted: Vec<usize> =
             (0..frames.len()).filter(|k| painted.contains(&moment(frames[*k]))).collect();
-        let wanted = if at_painted.is_empty() { (0..frames.len()).collect() } else { at_painted.clone() };
+        let chosen = if at_painted.is_empty() { (0..frames.len()).collect() } else { at_painted.clone() };
         let mut keyframes = BTreeMap::new();
-        for k in wanted {
+        for k in chosen {
             interrupt::go_on()?;
             let frame = frames[k];
             let mut known = Vec::new();
