@@ -168,7 +168,8 @@ impl Phases {
 
     /// One more unit of the present phase is done.
     pub fn advance(&self) {
-        self.advance_to(self.0.done.load(Ordering::Relaxed) + 1);
+        self.0.done.fetch_add(1, Ordering::Relaxed);
+        self.report();
     }
 
     /// Sets the units that are done of the present phase.
@@ -414,6 +415,29 @@ mod tests {
         let ended = TrainEvent::PhaseEnded { phase, done: 1, total, steps: 1, wall_s: 4.0, cpu_s: 8.0 };
         assert_eq!(events.last(), Some(&ended));
         assert_eq!(events.len(), 5, "the second report comes too soon: {events:?}");
+    }
+
+    #[test]
+    fn units_that_threads_finish_at_the_same_time_are_all_counted() {
+        const UNITS: usize = 100_000;
+        let ended: Arc<Mutex<Option<u64>>> = Arc::default();
+        let phases = Phases::default().reported_to({
+            let ended = Arc::clone(&ended);
+            move |event| {
+                if let TrainEvent::PhaseEnded { done, .. } = event {
+                    *ended.lock().unwrap() = Some(*done);
+                }
+                Control::Continue
+            }
+        });
+        let search = phases.enter(Phase::Search, 2 * UNITS);
+        std::thread::scope(|scope| {
+            for _ in 0..2 {
+                scope.spawn(|| (0..UNITS).for_each(|_| phases.advance()));
+            }
+        });
+        drop(search);
+        assert_eq!(*ended.lock().unwrap(), Some(2 * UNITS as u64));
     }
 
     #[test]
