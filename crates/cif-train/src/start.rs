@@ -1,4 +1,4 @@
-//! What a run starts from.
+//! The capture and the phases that a run starts from.
 
 use cif_dataset::Dataset;
 

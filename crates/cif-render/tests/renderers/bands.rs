@@ -46,7 +46,7 @@ fn rows<T: Clone>(grid: &PixelGrid<T>, first: u32, like: &PixelGrid<T>) -> Pixel
     PixelGrid::from_pixels(grid.width, like.height, grid.pixels[start..start + like.pixels.len()].to_vec())
 }
 
-/// What both drew.
+/// Pictures that both drew.
 fn both<'a, T>(whole: &'a Option<T>, band: &'a Option<T>) -> (&'a T, &'a T) {
     whole.as_ref().zip(band.as_ref()).expect("both were asked for it")
 }

@@ -1,4 +1,4 @@
-//! What a head is: the loss, values and tensors that it declares.
+//! Traits of heads: the loss, values and tensors that a head declares.
 
 use std::sync::Arc;
 

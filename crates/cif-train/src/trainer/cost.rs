@@ -12,10 +12,10 @@ const RECENT: f64 = 1.0 / 3.0;
 const SHORTEST_S: f64 = 10.0;
 const LONGEST_S: f64 = 60.0;
 
-/// What a step works on.
+/// Load of a step.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Load {
-    /// Pixels of their images, relative to those that are worked on.
+    /// Pixels of its image, relative to those that are worked on.
     pub pixels: f64,
     /// Gaussians.
     pub gaussians: f64,

@@ -87,7 +87,7 @@ impl Trainer {
         (0..field.gaussians.len()).filter(|row| !is_still(row) && !has_pose(row)).count() as f64
     }
 
-    /// What a step to come works on, `is_behind` the first test of which Gaussians stand still.
+    /// Load of a step to come, `is_behind` the first test of which Gaussians stand still.
     fn load_at(&self, stage: Stage, step: u32, is_behind: bool) -> Load {
         let gaussians = self.gaussians_at(stage, step);
         let moves = match self.state.progress.stage {

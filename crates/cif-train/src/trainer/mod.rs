@@ -149,7 +149,7 @@ pub struct Trainer {
     stage_since: Option<(Stage, f64)>,
     /// Events of steps that were taken in, not sent yet.
     arrived: Vec<TrainEvent>,
-    /// What its steps took so far.
+    /// Times of its steps so far.
     reports: Reports,
 }
 
