@@ -37,10 +37,12 @@ impl Trainer {
         let all = |of: Stage| self.stages.iterations(&self.state.config, of);
         let done = |of: Stage| if of == stage { self.state.progress.iteration } else { 0 };
         let test = self.first_test(stage);
+        let share = self.moving_share();
         let step_s = |of: Stage, step: u32| {
             let is_behind = test.is_some_and(|test| of > stage || step > test);
+            let moving = if is_behind { MOVING * share } else { share };
             let weight = if of == Stage::Instance { INSTANCE } else { 1.0 };
-            weight * cost.step_s(&self.load_at(of, step, is_behind))
+            weight * cost.step_s(&self.load_at(of, step, moving))
         };
         // Costs change slowly but for a few steps, so that some stand for all.
         let left_s = |of: Stage| {
@@ -87,16 +89,20 @@ impl Trainer {
         (0..field.gaussians.len()).filter(|row| !is_still(row) && !has_pose(row)).count() as f64
     }
 
-    /// Load of a step to come, `is_behind` the first test of which Gaussians stand still.
-    fn load_at(&self, stage: Stage, step: u32, is_behind: bool) -> Load {
-        let gaussians = self.gaussians_at(stage, step);
-        let moves = match self.state.progress.stage {
-            _ if stage == Stage::Coarse || !self.stages.is_dynamic => 0.0,
+    /// Share of the Gaussians that the deformation network moves, or will once there is one.
+    fn moving_share(&self) -> f64 {
+        match self.state.progress.stage {
+            _ if !self.stages.is_dynamic => 0.0,
             Stage::Coarse => MOVING,
             _ => self.moving() / (self.state.field.gaussians.len() as f64).max(1.0),
-        };
-        let fewer = if is_behind { MOVING } else { 1.0 };
-        Load { pixels: self.pixels_of_step(stage, step), gaussians, moving: fewer * moves * gaussians }
+        }
+    }
+
+    /// Load of a step to come, in which a share of the Gaussians moves, but in the coarse stage.
+    fn load_at(&self, stage: Stage, step: u32, share: f64) -> Load {
+        let gaussians = self.gaussians_at(stage, step);
+        let moving = if stage == Stage::Coarse { 0.0 } else { share * gaussians };
+        Load { pixels: self.pixels_of_step(stage, step), gaussians, moving }
     }
 
     /// The step of the fine stage that looks for Gaussians that stand still before any does; `None` where this step does not
@@ -240,8 +246,8 @@ mod tests {
         assert_eq!(trainer.moving(), n);
         trainer.state.field.deformation.as_mut().unwrap().still = (0..now as usize).map(|k| k > 2).collect();
         assert_eq!(trainer.moving(), 3.0);
-        assert_eq!(trainer.load_at(Stage::Fine, 90, false).moving, 3.0);
-        assert_eq!(trainer.load_at(Stage::Coarse, 90, false).moving, 0.0);
+        assert_eq!(trainer.load_at(Stage::Fine, 90, trainer.moving_share()).moving, 3.0);
+        assert_eq!(trainer.load_at(Stage::Coarse, 90, trainer.moving_share()).moving, 0.0);
         trainer.state.field.deformation.as_mut().unwrap().still.clear();
         // Before it is known what stands still, fewer will move behind the first test.
         trainer.shows_changes = false;
