@@ -8,8 +8,7 @@ use super::kernel::{Kernel, Module, Snippet, structures};
 use super::layout::Shared;
 use super::stages::entries;
 use super::view::{
-    BLEND_CHANNELS, COLOR_PASS, CONSTANTS, INSTANCE_PASS, NUMBERS, PARTIAL_SUMS, SPLAT, TILE_BACKWARD,
-    TILE_FORWARD, TILE_STAGING, VIEW,
+    BATCH_SUMS, BLEND_CHANNELS, COLOR_PASS, CONSTANTS, INSTANCE_PASS, NUMBERS, SPLAT, TILE_STAGING, VIEW,
 };
 use crate::{BlendRequest, Blending, GeometryPath};
 
@@ -57,7 +56,7 @@ const WITH_WEIGHTS: Snippet = Snippet {
 pub const BLEND: Module = Module {
     name: "blend",
     text: include_str!("blend.wgsl"),
-    imports: &[CONSTANTS, VIEW, SPLAT, BLEND_CHUNK, TILE_STAGING, TILE_FORWARD, BLEND_VALUES],
+    imports: &[CONSTANTS, VIEW, SPLAT, BLEND_CHUNK, TILE_STAGING, BLEND_VALUES],
     entries: &["blend"],
 };
 
@@ -65,33 +64,13 @@ pub const BLEND: Module = Module {
 pub const BLEND_BACKWARD: Module = Module {
     name: "blend_backward",
     text: include_str!("blend_backward.wgsl"),
-    imports: &[
-        CONSTANTS,
-        VIEW,
-        SPLAT,
-        BLEND_CHUNK,
-        TILE_STAGING,
-        TILE_BACKWARD,
-        BLEND_VALUES,
-        PARTIAL_SUMS,
-        VALUES_ONLY,
-    ],
+    imports: &[CONSTANTS, VIEW, SPLAT, BLEND_CHUNK, TILE_STAGING, BATCH_SUMS, BLEND_VALUES, VALUES_ONLY],
     entries: &["blend_backward"],
 };
 
 /// Gradients of pairs by values and weights.
 pub const BLEND_BACKWARD_WEIGHTS: Module = Module {
-    imports: &[
-        CONSTANTS,
-        VIEW,
-        SPLAT,
-        BLEND_CHUNK,
-        TILE_STAGING,
-        TILE_BACKWARD,
-        BLEND_VALUES,
-        PARTIAL_SUMS,
-        WITH_WEIGHTS,
-    ],
+    imports: &[CONSTANTS, VIEW, SPLAT, BLEND_CHUNK, TILE_STAGING, BATCH_SUMS, BLEND_VALUES, WITH_WEIGHTS],
     ..BLEND_BACKWARD
 };
 

@@ -1,5 +1,5 @@
 // Blends four channels of values per Gaussian over the pixels of a tile, front to back, with the weights of colour or of
-// instances. A workgroup is a tile, an invocation a pixel of each of its quadrants. Rust twin: cpu/blend.rs. Source:
+// instances. A workgroup is a tile, an invocation one of its pixels, or one of each quadrant. Rust twin: cpu/blend.rs. Source:
 // methods reference 3.1 (pixel loop) and 4.1.
 
 #import constants
@@ -58,7 +58,7 @@ fn write(p: Pixel) {
     }
 }
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(INVOCATIONS)
 fn blend(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
     blend_tile(workgroup, local);
 }

@@ -98,29 +98,26 @@ fn stage_more(count: u32, local: u32) {
     }
 }
 
-fn leave(sums: Sums, at: u32) {
-    partial_sums[at] = sums.values.x;
-    partial_sums[at + 64u] = sums.values.y;
-    partial_sums[at + 128u] = sums.values.z;
-    partial_sums[at + 192u] = sums.values.w;
+fn leave(sums: Sums, k: u32, lane: Lane) {
     if (WITH_WEIGHTS) {
-        partial_sums[at + 256u] = sums.first.x;
-        partial_sums[at + 320u] = sums.first.y;
-        partial_sums[at + 384u] = sums.first.z;
-        partial_sums[at + 448u] = sums.first.w;
-        partial_sums[at + 512u] = sums.second.x;
-        partial_sums[at + 576u] = sums.second.y;
+        leave_ten(k, sums.values, sums.first, sums.second, lane);
+    } else {
+        leave_four(k, sums.values, lane);
     }
 }
 
 // No labels, no responsibilities.
-fn begin_tile(labels: vec4u, local: u32) {}
+const WITH_LABELS: bool = false;
 fn longest_of_rows() -> u32 { return 0u; }
-fn keep_responsibility(responsibility: vec4f, at: u32) {}
-fn sum_responsibilities(own: u32, part: u32, local: u32, count: u32, batch: u32, longest_row: u32) {}
+fn keep_responsibility(responsibility: f32, k: u32, pixel: u32) {}
+fn sum_responsibilities(local: u32, count: u32, batch: u32, longest_row: u32) {}
 fn clear_row(entry: vec4u) {}
 
-@compute @workgroup_size(64)
-fn blend_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
-    differentiate_tile(workgroup, local);
+@compute @workgroup_size(INVOCATIONS)
+fn blend_backward(
+    @builtin(workgroup_id) workgroup: vec3u,
+    #paste lane_builtins
+) {
+    #paste lane
+    differentiate_tile(workgroup, lane);
 }

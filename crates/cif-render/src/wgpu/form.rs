@@ -1,6 +1,7 @@
 //! The two forms of what the invocations of a workgroup do together: through workgroup memory, which every device has,
 //! and by subgroups. A module imports `workgroup`, pastes `lane_builtins` into the parameters of its entry points and
-//! `lane` at their start; which form it gets is the device's.
+//! `lane` at their start; which form it gets is the device's. So are the walks over the splats of a tile: with a pixel per
+//! invocation, whose sums go by subgroups, or with four, which is what software does best.
 
 use super::snippet::Snippet;
 
@@ -18,12 +19,13 @@ impl Form {
     /// Both.
     pub const ALL: [Self; 2] = [Self::Portable, Self::Subgroups];
 
-    /// Snippets that modules import as `workgroup`, `lane_builtins` and `lane`.
+    /// Snippets that modules import as `workgroup`, `lane_builtins`, `lane`, `tile_forward`, `tile_backward` and
+    /// `partial_sums`.
     ///
     /// Subgroup built-ins are parameters and no members of a structure, for naga 30 misses those in HLSL; and it
     /// takes no `enable subgroups;`.
     #[must_use]
-    pub fn snippets(self) -> &'static [Snippet; 3] {
+    pub fn snippets(self) -> &'static [Snippet; 6] {
         match self {
             Self::Portable => &[
                 Snippet { name: "workgroup", text: || include_str!("shared/workgroup.wgsl").to_owned() },
@@ -32,6 +34,18 @@ impl Form {
                     text: || "@builtin(local_invocation_index) local: u32,".to_owned(),
                 },
                 Snippet { name: "lane", text: || "let lane = Lane(local);".to_owned() },
+                Snippet {
+                    name: "tile_forward",
+                    text: || include_str!("shared/tile_forward.wgsl").to_owned(),
+                },
+                Snippet {
+                    name: "tile_backward",
+                    text: || include_str!("shared/tile_backward.wgsl").to_owned(),
+                },
+                Snippet {
+                    name: "partial_sums",
+                    text: || include_str!("shared/partial_sums.wgsl").to_owned(),
+                },
             ],
             Self::Subgroups => &[
                 Snippet {
@@ -52,6 +66,18 @@ impl Form {
                     text: || {
                         "let lane = Lane(local, subgroup, subgroups, subgroupExclusiveAdd(1u));".to_owned()
                     },
+                },
+                Snippet {
+                    name: "tile_forward",
+                    text: || include_str!("shared/tile_forward_by_pixels.wgsl").to_owned(),
+                },
+                Snippet {
+                    name: "tile_backward",
+                    text: || include_str!("shared/tile_backward_by_pixels.wgsl").to_owned(),
+                },
+                Snippet {
+                    name: "partial_sums",
+                    text: || include_str!("shared/partial_sums_by_subgroups.wgsl").to_owned(),
                 },
             ],
         }

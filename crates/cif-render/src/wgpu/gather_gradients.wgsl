@@ -15,32 +15,60 @@
 @group(0) @binding(6) var<storage, read> work: array<u32>;
 @group(0) @binding(7) var<storage, read_write> splat_gradients: array<vec4f>;
 
-@compute @workgroup_size(64)
+// Invocations of a Gaussian, a sum each, and Gaussians of a workgroup.
+const LANES: u32 = 16u;
+const TOGETHER: u32 = 16u;
+
+var<workgroup> gathered: array<f32, LANES * TOGETHER>;
+
+// A number of a pair, 0 of what stands in for nothing.
+fn number_of(pair: u32, lane: u32) -> f32 {
+    let value = pair_sums[pair * PAIR_SUMS + lane];
+    return select(0.0, value, pairs[pair].x != NO_SPLAT);
+}
+
+@compute @workgroup_size(256)
 fn gather_gradients(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
-    let rank = item_of(workgroup, local, 64u);
-    if (rank >= view.gaussians) {
+    let lane = local % LANES;
+    let place = local / LANES;
+    let rank = item_of(workgroup, place, TOGETHER);
+    var sum = 0.0;
+    if (rank < view.gaussians && lane < GRADIENT_SUMS) {
+        // Without pairs at all when the lists did not fit.
+        let last = select(0u, pair_offsets[rank + 1u], work[WORK_PAIRS] > 0u);
+        var pair = pair_offsets[rank];
+        // Four at a time, so that none waits for the memory of the one before.
+        for (; pair + 4u <= last; pair += 4u) {
+            let a = number_of(pair, lane);
+            let b = number_of(pair + 1u, lane);
+            let c = number_of(pair + 2u, lane);
+            let d = number_of(pair + 3u, lane);
+            sum = (((sum + a) + b) + c) + d;
+        }
+        for (; pair < last; pair += 1u) {
+            sum += number_of(pair, lane);
+        }
+    }
+    gathered[local] = sum;
+    workgroupBarrier();
+    if (rank >= view.gaussians || lane >= 3u) {
         return;
     }
     let row = depth_order[rank];
-    var sums: array<f32, GRADIENT_SUMS>;
-    for (var k = 0u; k < GRADIENT_SUMS; k += 1u) {
-        sums[k] = 0.0;
-    }
-    // Without pairs at all when the lists did not fit.
-    let last = select(0u, pair_offsets[rank + 1u], work[WORK_PAIRS] > 0u);
-    for (var pair = pair_offsets[rank]; pair < last; pair += 1u) {
-        if (pairs[pair].x != NO_SPLAT) {
-            for (var k = 0u; k < GRADIENT_SUMS; k += 1u) {
-                sums[k] += pair_sums[pair * PAIR_SUMS + k];
-            }
-        }
-    }
     let splat = splats[row];
     let factor = splat.factor;
-    // v_sigma = -alpha v_alpha, alpha = o P and v_o = P v_alpha.
-    let v_opacity = select(0.0, -sums[8] / factor.w, factor.w > 0.0);
-    splat_gradients[3u * row] =
-        vec4f(factor.x * sums[0], factor.y * sums[0] + factor.z * sums[1], sums[2], sums[3]);
-    splat_gradients[3u * row + 1u] = vec4f(sums[4], sums[5], sums[6], sums[7]);
-    splat_gradients[3u * row + 2u] = vec4f(v_opacity, sums[9], select(0.0, 1.0, splat.radius > 0.0), 0.0);
+    let own = place * LANES;
+    var numbers: vec4f;
+    if (lane == 0u) {
+        let mean = vec2f(gathered[own], gathered[own + 1u]);
+        numbers = vec4f(
+            factor.x * mean.x, factor.y * mean.x + factor.z * mean.y, gathered[own + 2u], gathered[own + 3u]);
+    } else if (lane == 1u) {
+        numbers = vec4f(gathered[own + 4u], gathered[own + 5u], gathered[own + 6u], gathered[own + 7u]);
+    } else {
+        // v_sigma = -alpha v_alpha, alpha = o P and v_o = P v_alpha.
+        let v_opacity = select(0.0, -gathered[own + 8u] / factor.w, factor.w > 0.0);
+        numbers = vec4f(v_opacity, gathered[own + 9u], select(0.0, 1.0, splat.radius > 0.0), 0.0);
+    }
+    splat_gradients[3u * row + lane] = numbers;
 }

@@ -1,6 +1,5 @@
 // Blends the splats of a tile into pixels, front to back, for colour and for the probability of each pixel's own label
-// at once. A workgroup is a tile, an invocation a pixel of each of its quadrants, so that what is read of a splat serves
-// four. Writes the composited colour with the transmittance, and depth D, label probability M_y, instance transmittance
+// at once. A workgroup is a tile, an invocation one of its pixels, or one of each quadrant. Writes the composited colour with the transmittance, and depth D, label probability M_y, instance transmittance
 // S and the position in the list of the tile after the last splat that supports the label. Rust twin: cpu/rasterize.rs.
 // Source: methods reference 3.1 (pixel loop) and 4.2.
 
@@ -90,7 +89,7 @@ fn write(p: Pixel) {
     }
 }
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(INVOCATIONS)
 fn rasterize(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
     blend_tile(workgroup, local);
 }

@@ -13,15 +13,18 @@
 @group(0) @binding(8) var<storage, read_write> label_mass: array<f32>;
 #import identity
 
-// Splats that are summed at a time, and their sums.
-const BATCH: u32 = 4u;
+// Splats that are summed at a time, as many as workgroup memory holds, and their sums.
+const BATCH: u32 = select(4u, 2u, WITH_INSTANCES && INVOCATIONS > 64u);
 const SUMS: u32 = GRADIENT_SUMS;
+const WITH_LABELS: bool = WITH_INSTANCES;
 #import tile_backward
 
-// Weighted r of every splat of the batch, by invocation, a quadrant each.
-var<workgroup> responsibilities: array<vec4f, BATCH * 64u>;
-// Labels by invocation, 16 bits each, quadrants 0 and 1 first.
-var<workgroup> pixel_labels: array<vec2u, 64>;
+// Weighted r of every splat of the batch, by pixel.
+var<workgroup> responsibilities: array<f32, select(1u, BATCH * 256u, WITH_INSTANCES)>;
+// Invocations that sum the responsibilities of a splat.
+const PARTS: u32 = min(64u, INVOCATIONS / BATCH);
+// Where the sums of sixteen of them lie among the partial sums, behind those of all.
+const SIXTEENTHS: u32 = 4u * PARTS * BATCH;
 
 struct Pixel {
     centre: vec2f,
@@ -163,11 +166,14 @@ fn of_label(label: u32, labels: vec4u, values: vec4f) -> f32 {
 
 // Label mass of the batch, from the responsibilities of all invocations: of four entries of every row at a time. Every
 // invocation of the workgroup must come here.
-fn sum_responsibilities(own: u32, part: u32, local: u32, count: u32, batch: u32, longest_row: u32) {
+fn sum_responsibilities(local: u32, count: u32, batch: u32, longest_row: u32) {
+    let own = local / PARTS;
+    let part = local % PARTS;
+    let splat = min(batch + own, STAGED - 1u);
     var entry = 0u;
     loop {
-        let row_first = staged[batch + own].row_first + entry;
-        let row_end = select(0u, staged[batch + own].row_end, own < count);
+        let row_first = staged[splat].row_first + entry;
+        let row_end = select(0u, staged[splat].row_end, own < count);
         var mass = vec4f(0.0);
         if (row_first < row_end) {
             let last = row_end - 1u;
@@ -180,9 +186,14 @@ fn sum_responsibilities(own: u32, part: u32, local: u32, count: u32, batch: u32,
             // Of the pixels of four invocations.
             var at = part;
             loop {
-                let values = responsibilities[own * 64u + at];
-                let packed = pixel_labels[at];
-                let found = vec4u(packed & vec2u(0xffffu), packed >> vec2u(16u)).xzyw;
+                let first = own * 256u + 4u * at;
+                let values = vec4f(
+                    responsibilities[first],
+                    responsibilities[first + 1u],
+                    responsibilities[first + 2u],
+                    responsibilities[first + 3u],
+                );
+                let found = labels_at(at);
                 mass += vec4f(
                     of_label(row_labels.x, found, values),
                     of_label(row_labels.y, found, values),
@@ -190,22 +201,34 @@ fn sum_responsibilities(own: u32, part: u32, local: u32, count: u32, batch: u32,
                     of_label(row_labels.w, found, values),
                 );
                 continuing {
-                    at += 16u;
+                    at += PARTS;
                     break if at >= 64u;
                 }
             }
         }
-        partial_sums[4u * local] = mass.x;
-        partial_sums[4u * local + 1u] = mass.y;
-        partial_sums[4u * local + 2u] = mass.z;
-        partial_sums[4u * local + 3u] = mass.w;
+        if (own < BATCH) {
+            partial_sums[4u * local] = mass.x;
+            partial_sums[4u * local + 1u] = mass.y;
+            partial_sums[4u * local + 2u] = mass.z;
+            partial_sums[4u * local + 3u] = mass.w;
+        }
+        workgroupBarrier();
+        // Of sixteen invocations, then of all.
+        if (own < BATCH && part < PARTS / 4u) {
+            var sum = 0.0;
+            let first = 4u * (PARTS * own + 16u * (part / 4u)) + part % 4u;
+            for (var k = 0u; k < 16u; k += 1u) {
+                sum += partial_sums[first + 4u * k];
+            }
+            partial_sums[SIXTEENTHS + PARTS / 4u * own + part] = sum;
+        }
         workgroupBarrier();
         if (part < 4u && row_first + part < row_end) {
             var sum = 0.0;
-            for (var k = 0u; k < 16u; k += 1u) {
-                sum += partial_sums[4u * (16u * own + k) + part];
+            for (var k = part; k < PARTS / 4u; k += 4u) {
+                sum += partial_sums[SIXTEENTHS + PARTS / 4u * own + k];
             }
-            label_mass[staged[batch + own].slot + entry + part] = sum;
+            label_mass[staged[splat].slot + entry + part] = sum;
         }
         workgroupBarrier();
         continuing {
@@ -224,10 +247,6 @@ fn clear_row(entry: vec4u) {
     }
 }
 
-fn begin_tile(labels: vec4u, local: u32) {
-    pixel_labels[local] = labels.xz | (labels.yw << vec2u(16u));
-}
-
 fn longest_of_rows() -> u32 {
     if (!WITH_INSTANCES) {
         return 0u;
@@ -235,26 +254,21 @@ fn longest_of_rows() -> u32 {
     return workgroupUniformLoad(&longest);
 }
 
-fn leave(sums: Sums, at: u32) {
-    partial_sums[at] = sums.first.x;
-    partial_sums[at + 64u] = sums.first.y;
-    partial_sums[at + 128u] = sums.first.z;
-    partial_sums[at + 192u] = sums.first.w;
-    partial_sums[at + 256u] = sums.second.x;
-    partial_sums[at + 320u] = sums.second.y;
-    partial_sums[at + 384u] = sums.second.z;
-    partial_sums[at + 448u] = sums.second.w;
-    partial_sums[at + 512u] = sums.third.x;
-    partial_sums[at + 576u] = sums.third.y;
+fn leave(sums: Sums, k: u32, lane: Lane) {
+    leave_ten(k, sums.first, sums.second, sums.third, lane);
 }
 
-fn keep_responsibility(responsibility: vec4f, at: u32) {
+fn keep_responsibility(responsibility: f32, k: u32, pixel: u32) {
     if (WITH_INSTANCES) {
-        responsibilities[at] = responsibility;
+        responsibilities[256u * k + pixel] = responsibility;
     }
 }
 
-@compute @workgroup_size(64)
-fn rasterize_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
-    differentiate_tile(workgroup, local);
+@compute @workgroup_size(INVOCATIONS)
+fn rasterize_backward(
+    @builtin(workgroup_id) workgroup: vec3u,
+    #paste lane_builtins
+) {
+    #paste lane
+    differentiate_tile(workgroup, lane);
 }

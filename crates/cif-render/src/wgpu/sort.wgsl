@@ -1,5 +1,6 @@
-// One pass of a stable radix sort by 4 bits of 32-bit keys, each with a value: counts per block and digit, then (after
-// a prefix sum of the counts, digit by digit) every element to its place. Rust twin: cpu/bin.rs, `sort_by_depth`, and
+// One pass of a stable radix sort by 4 bits of 32-bit keys, each with a value: counts per block and digit, then every
+// element to its place, by a prefix sum of the counts, digit by digit: where there are few blocks each of them adds up
+// what lies before it, else the prefix sum has been made before. Rust twin: cpu/bin.rs, `sort_by_depth`, and
 // the counting sort of `TileLists::build`.
 
 #import constants
@@ -71,12 +72,56 @@ fn histogram(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_
     }
 }
 
+// First place of the block's elements, by digit.
+var<workgroup> starts: array<u32, 16>;
+
+// Elements before this block's with the same digit or a smaller one, from the counts. Every invocation must come here.
+fn find_starts(block: u32, blocks: u32, local: u32) {
+    if (parameters.is_summed != 0u) {
+        if (local < 16u && block < blocks) {
+            starts[local] = counts[local * blocks + block];
+        }
+        return;
+    }
+    // Sixteen invocations per digit: its elements, and those of the blocks before.
+    var all = 0u;
+    var before = 0u;
+    for (var other = local & 15u; other < blocks; other += 16u) {
+        let elements = counts[(local >> 4u) * blocks + other];
+        all += elements;
+        before += select(0u, elements, other < block);
+    }
+    packed[local] = all;
+    packed[256u + local] = before;
+    workgroupBarrier();
+    if (local < 16u) {
+        all = 0u;
+        before = 0u;
+        for (var k = 0u; k < 16u; k += 1u) {
+            all += packed[16u * local + k];
+            before += packed[256u + 16u * local + k];
+        }
+        chunks[local] = all;
+        starts[local] = before;
+    }
+    workgroupBarrier();
+    if (local < 16u) {
+        var start = starts[local];
+        for (var digit = 0u; digit < local; digit += 1u) {
+            start += chunks[digit];
+        }
+        starts[local] = start;
+    }
+    workgroupBarrier();
+}
+
 @compute @workgroup_size(256)
 fn scatter(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
     let block = item_of(workgroup, 0u, 1u);
     let total = count();
     let blocks = (total + SORT_BLOCK - 1u) / SORT_BLOCK;
     let first = block * SORT_BLOCK;
+    find_starts(block, blocks, local);
     count_own(first, total, local);
     workgroupBarrier();
     chunks[local] = sum_chunk(local);
@@ -99,7 +144,7 @@ fn scatter(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_in
             let digit = digit_of(key);
             let word = (digit >> 1u) * 256u + local;
             let half = (digit & 1u) * 16u;
-            let place = counts[digit * blocks + block] + ((packed[word] >> half) & 0xffffu);
+            let place = starts[digit] + ((packed[word] >> half) & 0xffffu);
             packed[word] += 1u << half;
             sorted_keys[place] = key;
             sorted_values[place] = values[index];

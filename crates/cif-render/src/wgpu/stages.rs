@@ -4,10 +4,9 @@ use super::device::Gpu;
 use super::error::GpuError;
 use super::kernel::{Kernel, Module};
 use super::view::{
-    COEFFICIENTS, COLOR_ONLY, CONSTANTS, DIRECTIONS, FOOTPRINT, HARMONICS, IDENTITY, NUMBERS,
-    PACKED_COEFFICIENTS, PARTIAL_SUMS, SCAN_PARAMETERS, SORT_PARAMETERS, SPLAT, SPLAT_GRADIENTS,
-    TILE_BACKWARD, TILE_FORWARD, TILE_STAGING, TILES, TORQUES, TURNED_DIRECTIONS, TURNS, VIEW,
-    WITH_INSTANCES,
+    BATCH_SUMS, COEFFICIENTS, COLOR_ONLY, CONSTANTS, DIRECTIONS, FOOTPRINT, HARMONICS, IDENTITY, NUMBERS,
+    PACKED_COEFFICIENTS, SCAN_PARAMETERS, SORT_PARAMETERS, SPLAT, SPLAT_GRADIENTS, TILE_STAGING, TILES,
+    TORQUES, TURNED_DIRECTIONS, TURNS, VIEW, WITH_INSTANCES,
 };
 
 /// Projection.
@@ -72,15 +71,13 @@ pub const RANGES: Module = Module {
 pub const RASTERIZE: Module = Module {
     name: "rasterize",
     text: include_str!("rasterize.wgsl"),
-    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, TILE_STAGING, TILE_FORWARD, IDENTITY],
+    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, TILE_STAGING, IDENTITY],
     entries: &["rasterize"],
 };
 
 /// Blending of colour alone.
-pub const RASTERIZE_COLOR: Module = Module {
-    imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, TILE_STAGING, TILE_FORWARD, IDENTITY],
-    ..RASTERIZE
-};
+pub const RASTERIZE_COLOR: Module =
+    Module { imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, TILE_STAGING, IDENTITY], ..RASTERIZE };
 
 /// Instance images.
 pub const DENSE: Module = Module {
@@ -102,13 +99,13 @@ pub const COTANGENTS: Module = Module {
 pub const RASTERIZE_BACKWARD: Module = Module {
     name: "rasterize_backward",
     text: include_str!("rasterize_backward.wgsl"),
-    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, TILE_STAGING, TILE_BACKWARD, IDENTITY, PARTIAL_SUMS],
+    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, TILE_STAGING, BATCH_SUMS, IDENTITY],
     entries: &["rasterize_backward"],
 };
 
 /// Gradients of pairs from colour alone.
 pub const RASTERIZE_BACKWARD_COLOR: Module = Module {
-    imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, TILE_STAGING, TILE_BACKWARD, IDENTITY, PARTIAL_SUMS],
+    imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, TILE_STAGING, BATCH_SUMS, IDENTITY],
     ..RASTERIZE_BACKWARD
 };
 

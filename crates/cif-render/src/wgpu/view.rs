@@ -161,8 +161,8 @@ crate::shared_struct! {
         pub work_element: u32,
         /// First of the four bits.
         pub shift: u32,
-        /// Pads to 16 bytes.
-        pub unused: u32,
+        /// 1 where counts are prefix sums, 0 where they are counts.
+        pub is_summed: u32,
     }
 }
 
@@ -330,12 +330,8 @@ pub(crate) const TILES: Snippet =
     Snippet { name: "tiles", text: || include_str!("shared/tiles.wgsl").to_owned() };
 pub(crate) const TILE_STAGING: Snippet =
     Snippet { name: "tile_staging", text: || include_str!("shared/tile_staging.wgsl").to_owned() };
-pub(crate) const TILE_FORWARD: Snippet =
-    Snippet { name: "tile_forward", text: || include_str!("shared/tile_forward.wgsl").to_owned() };
-pub(crate) const TILE_BACKWARD: Snippet =
-    Snippet { name: "tile_backward", text: || include_str!("shared/tile_backward.wgsl").to_owned() };
-pub(crate) const PARTIAL_SUMS: Snippet =
-    Snippet { name: "partial_sums", text: || include_str!("shared/partial_sums.wgsl").to_owned() };
+pub(crate) const BATCH_SUMS: Snippet =
+    Snippet { name: "batch_sums", text: || include_str!("shared/batch_sums.wgsl").to_owned() };
 pub(crate) const IDENTITY: Snippet =
     Snippet { name: "identity", text: || include_str!("shared/identity.wgsl").to_owned() };
 /// Declares that the instance pass is drawn, or is not: what a kernel does not do costs nothing then.

@@ -89,6 +89,12 @@ fn differences(found: &[[u32; 4]]) -> Option<String> {
             _ => return Some(format!("invocation {local} has rank {rank}, which is taken or too large")),
         }
         let expected = [before(rank, small), before(all, small), before(rank, large), before(all, large)];
+        let place = rows[2][1];
+        // Four places from a multiple of four on.
+        let (of_neighbours, sum) = (f32::from_bits(rows[2][2]), (4 * (place & !3) + 6) as f32);
+        if of_neighbours != sum {
+            return Some(format!("the sum of the neighbours of place {place} is {of_neighbours}, not {sum}"));
+        }
         let of_counts = [rows[1][1], rows[1][2], rows[1][3], rows[2][0]];
         if of_counts != expected {
             return Some(format!("prefix sums at rank {rank} are {of_counts:?}, not {expected:?}"));
@@ -122,7 +128,8 @@ mod tests {
                 let rank = (local * 37 + 11) % INVOCATIONS as u32;
                 let small = |rank: u32| 3 * (rank * rank.saturating_sub(1) / 2) + rank;
                 let counts = [rank, small(rank), small(INVOCATIONS as u32), below(rank)];
-                [sums, counts, [below(INVOCATIONS as u32), 0, 0, 0]]
+                let of_neighbours = (4 * (local & !3) + 6) as f32;
+                [sums, counts, [below(INVOCATIONS as u32), local, of_neighbours.to_bits(), 0]]
             })
             .collect();
         assert_eq!(differences(&right), None);
@@ -138,7 +145,9 @@ mod tests {
         fails(3 * 9 + 1, [900, 0, 0, 0], "too large");
         let [rank, small, all, large] = right[3 * 200 + 1];
         fails(3 * 200 + 1, [rank, small + 1, all, large], "prefix sums");
-        fails(3 * 200 + 2, [0; 4], "prefix sums");
+        fails(3 * 200 + 2, [0; 4], "neighbours");
+        let [_, place, of_neighbours, _] = right[3 * 200 + 2];
+        fails(3 * 200 + 2, [0, place, of_neighbours, 0], "prefix sums");
     }
 
     #[test]

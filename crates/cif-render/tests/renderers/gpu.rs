@@ -338,31 +338,41 @@ fn compact_pictures_are_within_half_a_level() {
     assert!(least > 5e-5, "the coefficients really are rounded: {least}");
 }
 
-/// Nothing depends on the order in which the device runs workgroups; and subgroups, where they are there, sum
-/// integers alone of what is drawn, so that it is the same without them.
+/// Nothing depends on the order in which the device runs workgroups; and what is drawn is the same with subgroups and
+/// without them, gradients but for the order in which pixels are added.
 #[test]
 fn two_runs_give_the_same_bits() {
     let Some(mut device) = device() else { return };
     let scene = generate(&SyntheticConfig { gaussians: 3000, ..config() });
     let cotangents = Cotangents::random(3, 71, 53);
-    let bits = |outcome: &Outcome| -> Vec<u32> {
-        let all = [
-            outcome.colors.as_flattened(),
-            outcome.geometry.as_flattened(),
-            outcome.sh.as_flattened(),
-            &outcome.calibrations,
-        ];
-        all.into_iter().flatten().map(|v| v.to_bits()).collect()
+    let gradients = |outcome: &Outcome| {
+        let Outcome { geometry, sh, calibrations, .. } = outcome;
+        [geometry.as_flattened().to_vec(), sh.as_flattened().to_vec(), calibrations.clone()]
     };
-    let first = bits(&run(&mut device, &scene, &settings(), &cotangents, |_| {}).unwrap());
+    let bits = |outcome: &Outcome| -> Vec<u32> {
+        let drawn = outcome.colors.as_flattened().iter().copied();
+        drawn.chain(gradients(outcome).concat()).map(f32::to_bits).collect()
+    };
+    let reference = run(&mut device, &scene, &settings(), &cotangents, |_| {}).unwrap();
+    let first = bits(&reference);
     for _ in 0..3 {
         assert!(bits(&run(&mut device, &scene, &settings(), &cotangents, |_| {}).unwrap()) == first);
     }
     for gpu in testing::gpus() {
         let form = gpu.form();
         let rasterizer = Rasterizer::new(&gpu).unwrap();
-        let outcome = run(&mut (gpu, rasterizer), &scene, &settings(), &cotangents, |_| {}).unwrap();
-        assert!(bits(&outcome) == first, "{form:?}");
+        let mut device = (gpu, rasterizer);
+        let outcome = run(&mut device, &scene, &settings(), &cotangents, |_| {}).unwrap();
+        let again = run(&mut device, &scene, &settings(), &cotangents, |_| {}).unwrap();
+        assert!(bits(&again) == bits(&outcome), "{form:?}");
+        assert!(outcome.colors == reference.colors, "{form:?}");
+        for (found, expected) in gradients(&outcome).into_iter().zip(gradients(&reference)) {
+            let largest = expected.iter().fold(0.0_f32, |largest, value| largest.max(value.abs()));
+            let differences = found.iter().zip(&expected).map(|(a, b)| (a - b).abs());
+            let worst = differences.fold(0.0_f32, f32::max);
+            println!("{form:?}: gradients differ by {:.1e} of the largest", worst / largest);
+            assert!(largest > 0.0 && worst <= 1e-5 * largest, "{form:?}: {worst} of {largest}");
+        }
     }
     let moved = |splats: &mut Vec<Splat>| splats[0].mean[0] += 1e-3;
     assert!(bits(&run(&mut device, &scene, &settings(), &cotangents, moved).unwrap()) != first);

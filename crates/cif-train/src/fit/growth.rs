@@ -13,8 +13,8 @@ use crate::step::InstancePass;
 use crate::times::StepTimes;
 use crate::trainer::Trainer;
 
-/// Steps before measuring.
-const WARM_UP: usize = 2;
+/// Steps before measuring, on the processor and on a GPU, which has a queue of steps to fill first.
+const WARM_UP: (usize, usize) = (2, 20);
 
 /// Fewest steps that are measured, and the most.
 const STEPS: (usize, usize) = (3, 50);
@@ -29,20 +29,18 @@ pub struct Grown {
     pub steps: Vec<StepTimes>,
 }
 
-/// Measures steps of the fine stage, for about as long as `limit`, with the points of the capture, or the Gaussians of a
-/// scene, thinned out evenly or split until there are `gaussians`; a share of them moves. Those that are split are smaller,
-/// as in training.
+/// A run that stands at the fine stage, with the points of the capture, or the Gaussians of a scene, thinned out evenly
+/// or split until there are `gaussians`; a share of them moves. Those that are split are smaller, as in training.
 ///
 /// # Errors
 /// As [`Trainer::new`]; when the scene has other instances than the capture.
-pub fn grown(
+pub fn filled(
     dataset: &Dataset,
     config: &TrainConfig,
     scene: Option<Field>,
     gaussians: usize,
     moving: f64,
-    limit: Duration,
-) -> Result<Grown, TrainError> {
+) -> Result<Trainer, TrainError> {
     let mut config = config.clone();
     config.report.withhold = 0;
     config.motion.guidance = 0.0;
@@ -50,7 +48,15 @@ pub fn grown(
     let scene = scene.map(|scene| thinned(scene, gaussians));
     let mut trainer = Trainer::for_measuring(few_training_frames(dataset), config, scene, Stage::Fine, 0)?;
     trainer.fill(gaussians, moving);
-    for _ in 0..WARM_UP {
+    Ok(trainer)
+}
+
+/// Measures steps of a run, for about as long as `limit`.
+///
+/// # Errors
+/// As [`Trainer::run`].
+pub fn grown(trainer: &mut Trainer, limit: Duration) -> Result<Grown, TrainError> {
+    for _ in 0..if trainer.gpu_name().is_some() { WARM_UP.1 } else { WARM_UP.0 } {
         trainer.measure_step(InstancePass::Off)?;
     }
     let begun = Instant::now();
@@ -58,7 +64,7 @@ pub fn grown(
     while steps.len() < STEPS.0 || (begun.elapsed() < limit && steps.len() < STEPS.1) {
         steps.push(trainer.measure_step(InstancePass::Off)?);
     }
-    let camera = dataset.frames.first().map(|frame| frame.camera);
+    let camera = trainer.dataset().frames.first().map(|frame| frame.camera);
     let image_size = camera.map_or([0; 2], |camera| [camera.width, camera.height]);
     Ok(Grown { gaussians: trainer.field().gaussians.len(), image_size, steps })
 }

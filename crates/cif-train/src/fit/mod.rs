@@ -15,4 +15,4 @@ mod growth;
 pub use calibrate::{Calibration, calibrate};
 pub use choose::{Change, Choice, choose, share_of_fits, stretched};
 pub use expected::{Expected, Workload};
-pub use growth::{Grown, grown};
+pub use growth::{Grown, filled, grown};

@@ -267,6 +267,9 @@ fn column(parameter: &Parameter) -> Constant {
     Constant::Unsigned(geometry_column(parameter).expect("a parameter of the geometry") as u32)
 }
 
+/// Rows of a plane that a thread of the optimiser goes down.
+pub(super) const BAND: usize = 8;
+
 const CONSTANTS: Snippet = Snippet {
     name: "constants",
     text: || {
@@ -296,6 +299,7 @@ const CONSTANTS: Snippet = Snippet {
             ("JUDGED_ROW", Constant::Unsigned(held_out::FIRST.1)),
             ("PLANES_FAULT", Constant::Unsigned(fault::bit(&PLANES))),
             ("MAX_WORKGROUPS", Constant::Unsigned(MAX_WORKGROUPS)),
+            ("BAND", Constant::Unsigned(BAND as u32)),
             ("POSE_DECAY_1", Constant::Float(poses::DECAY[0] as f32)),
             ("POSE_DECAY_2", Constant::Float(poses::DECAY[1] as f32)),
             ("POSE_SHARE_1", Constant::Float((1.0 - poses::DECAY[0]) as f32)),
@@ -396,7 +400,7 @@ pub const ADAM_PLANES: Module = Module {
     name: "adam_planes",
     text: include_str!("adam_planes.wgsl"),
     imports: &[CONSTANTS, PLANE_RATES, FIXED_POINT, ADAM],
-    entries: &["adam_planes"],
+    entries: &["add_up", "move_nodes"],
 };
 
 /// Sums over the views of a step, and statistics.

@@ -10,8 +10,8 @@ use cif_render::wgpu::{
 };
 
 use super::kernels::{
-    ACCUMULATE, ADAM_GAUSSIANS, ADAM_NETWORK, ADAM_PLANES, Accumulation, GaussianRates, GroupRates, IDENTITY,
-    PlaneRates, entries, fault,
+    ACCUMULATE, ADAM_GAUSSIANS, ADAM_NETWORK, ADAM_PLANES, Accumulation, BAND, GaussianRates, GroupRates,
+    IDENTITY, PlaneRates, entries, fault,
 };
 use crate::adam::planes::factors;
 use crate::adam::{BiasCorrection, PlaneWeights, RowRates};
@@ -156,7 +156,7 @@ pub struct GpuOptimiser {
     geometry: Kernel,
     sh: Kernel,
     network: Kernel,
-    planes: Kernel,
+    planes: [Kernel; 2],
     add: Kernel,
     add_screen: Kernel,
     add_statistics: Kernel,
@@ -180,7 +180,7 @@ impl GpuOptimiser {
     pub fn new(gpu: &Gpu) -> Result<Self, GpuError> {
         let [geometry, sh] = entries(gpu, &ADAM_GAUSSIANS)?;
         let [network] = entries(gpu, &ADAM_NETWORK)?;
-        let [planes] = entries(gpu, &ADAM_PLANES)?;
+        let planes = entries(gpu, &ADAM_PLANES)?;
         let [add, add_screen, add_statistics] = entries(gpu, &ACCUMULATE)?;
         let [identity] = entries(gpu, &IDENTITY)?;
         Ok(Self {
@@ -351,7 +351,7 @@ impl GpuOptimiser {
         );
         commands.stage("optimiser: Gaussians", |stage| {
             stage.dispatch(&self.geometry, &geometry, workgroups(n, 64));
-            stage.dispatch(&self.sh, &sh, workgroups(n * SH_FLOATS, 256));
+            stage.dispatch(&self.sh, &sh, workgroups(n * SH_FLOATS / 4, 256));
         });
     }
 
@@ -400,7 +400,7 @@ impl GpuOptimiser {
         faults: &GpuVec<u32>,
     ) -> Result<(), GpuError> {
         let Optimised { parameters: deformation, gradients, moments: [of_planes, of_network] } = *deformation;
-        let (rates, places) = plane_rates(deformation.config(), weights, groups.of(&PLANES));
+        let (rates, bands, places) = plane_rates(deformation.config(), weights, groups.of(&PLANES));
         self.plane_rates.write(gpu, &rates);
         self.plane_places.replace(gpu, &places)?;
         let (rate, second) = groups.of(&MLP).corrected();
@@ -416,7 +416,7 @@ impl GpuOptimiser {
                 ..GroupRates::default()
             },
         );
-        let planes = self.planes.bind(
+        let planes = self.planes[0].bind(
             gpu,
             &[
                 self.plane_rates.binding(),
@@ -440,7 +440,9 @@ impl GpuOptimiser {
             ],
         );
         commands.stage("optimiser: planes", |stage| {
-            stage.dispatch(&self.planes, &planes, workgroups(rates.columns as usize, 64));
+            for kernel in &self.planes {
+                stage.dispatch(kernel, &planes, workgroups(rates.columns as usize * bands, 64));
+            }
         });
         commands.stage("optimiser: network", |stage| {
             stage.dispatch(&self.network, &network, workgroups(floats, 64));
@@ -449,15 +451,15 @@ impl GpuOptimiser {
     }
 }
 
-/// Rates, and places and factors of all planes.
+/// Rates, bands of the longest columns, and places and factors of all planes.
 fn plane_rates(
     config: &DeformationConfig,
     weights: &PlaneWeights,
     step: GroupStep,
-) -> (PlaneRates, Vec<[u32; 4]>) {
+) -> (PlaneRates, usize, Vec<[u32; 4]>) {
     let (levels, _) = config.plane_layout();
     let channels = config.channels as usize;
-    let (mut places, mut columns) = (Vec::new(), 0);
+    let (mut places, mut columns, mut rows) = (Vec::new(), 0, 0);
     for level in &levels {
         for (plane, layout) in level.iter().enumerate() {
             let row = (layout.columns * channels) as u32;
@@ -465,8 +467,10 @@ fn plane_rates(
             let (smooth, sparse) = factors(layout, plane, channels, weights);
             places.push([smooth.to_bits(), sparse.to_bits(), 0, 0]);
             columns += row;
+            rows = layout.rows.max(rows);
         }
     }
     let (rate, second) = step.corrected();
-    (PlaneRates { planes: places.len() as u32 / 2, columns, rate, second }, places)
+    let rates = PlaneRates { planes: places.len() as u32 / 2, columns, rate, second };
+    (rates, rows.div_ceil(BAND), places)
 }

@@ -56,9 +56,21 @@ fn main(
             let local = item / quads;
             let column = item % quads;
             var delta = weights[output + WIDTH * quads + column];
-            for (var k = 0u; k < WIDTH; k++) {
-                let hidden = activations[HIDDEN_REGION + k * ROW_QUADS + local / 4u][local % 4u];
-                delta += hidden * weights[output + k * quads + column];
+            let first = HIDDEN_REGION + local / 4u;
+            let from_weight = output + column;
+            var k = 0u;
+            for (; k + 4u <= WIDTH; k += 4u) {
+                let w0 = weights[from_weight + k * quads];
+                let w1 = weights[from_weight + (k + 1u) * quads];
+                let w2 = weights[from_weight + (k + 2u) * quads];
+                let w3 = weights[from_weight + (k + 3u) * quads];
+                delta += activations[first + k * ROW_QUADS][local % 4u] * w0;
+                delta += activations[first + (k + 1u) * ROW_QUADS][local % 4u] * w1;
+                delta += activations[first + (k + 2u) * ROW_QUADS][local % 4u] * w2;
+                delta += activations[first + (k + 3u) * ROW_QUADS][local % 4u] * w3;
+            }
+            for (; k < WIDTH; k++) {
+                delta += activations[first + k * ROW_QUADS][local % 4u] * weights[from_weight + k * quads];
             }
             if at.x == SH_COMPONENT {
                 let moved = first_row + local;

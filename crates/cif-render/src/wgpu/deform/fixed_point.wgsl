@@ -36,10 +36,19 @@ fn add_fixed(index: u32, value: f32) {
 
 // The sum, which becomes zero; for one thread per sum.
 fn take_fixed(index: u32) -> f32 {
-    let low = atomicLoad(&sums[2u * index]);
-    let high = atomicLoad(&sums[2u * index + 1u]);
+    let sum = fixed_sum(index);
+    clear_fixed(index);
+    return sum;
+}
+
+fn clear_fixed(index: u32) {
     atomicStore(&sums[2u * index], FIXED_MIDDLE);
     atomicStore(&sums[2u * index + 1u], 0u);
+}
+
+fn fixed_sum(index: u32) -> f32 {
+    let low = atomicLoad(&sums[2u * index]);
+    let high = atomicLoad(&sums[2u * index + 1u]);
     return f32(bitcast<i32>(high)) / FIXED_SCALE
         + f32(bitcast<i32>(low ^ FIXED_MIDDLE)) / (FIXED_SCALE * FIXED_LOW);
 }

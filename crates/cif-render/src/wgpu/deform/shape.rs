@@ -64,8 +64,8 @@ const ROWS: [u32; 3] = [32, 16, 8];
 /// Most bytes that the scratch of a chunk takes, where the device allows as much.
 const SCRATCH_BYTES: u64 = 64 << 20;
 
-/// Most Gaussians of a chunk.
-const CHUNK_ROWS: u64 = 8_192;
+/// Most Gaussians of a chunk, so that a few dispatches fill the device.
+const CHUNK_ROWS: u64 = 32_768;
 
 /// Parts that weight gradients are summed in.
 pub const SPLITS: u32 = 32;

@@ -263,7 +263,8 @@ fn gradients_agree_with_the_reference_and_repeat_to_the_bit() {
 #[test]
 fn several_chunks_are_as_one() {
     let Some(gpu) = testing::gpu() else { return };
-    let n = 9_000;
+    // More than a chunk holds.
+    let n = 34_000;
     let scene = scene(SOME_HEADS, n);
     let field = &scene.field;
     let deformation = GpuDeformation::new(&gpu, field.deformation.as_ref().expect("has one")).unwrap();

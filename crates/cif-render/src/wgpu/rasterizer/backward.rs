@@ -106,7 +106,7 @@ impl Rasterizer {
             arrays.splat_gradients.buffer(),
         ];
         let gather = self.cache.get(gpu, ("gather_gradients", 0), &kernels.gather_gradients, &bindings);
-        let groups = workgroups(view.gaussians as usize, 64);
+        let groups = workgroups(view.gaussians as usize, 16);
         commands.stage("gather gradients", |stage| {
             stage.dispatch(&kernels.gather_gradients, &gather, groups);
         });

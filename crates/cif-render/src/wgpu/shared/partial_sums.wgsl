@@ -1,8 +1,39 @@
 // Sums over the 64 invocations of a workgroup, in a fixed order, of what each of them leaves in workgroup memory. The
-// module declares BATCH, how many splats are summed at a time, and SUMS, how many sums each of them has.
+// module declares BATCH, how many splats are summed at a time, and SUMS, how many sums each of them has. Sums by subgroups
+// would take ten instructions where this takes a store and a load. Twin: partial_sums_by_subgroups.wgsl.
 
 // Of every splat of the batch and sum, by invocation.
 var<workgroup> partial_sums: array<f32, BATCH * SUMS * 64u>;
+
+// Leaves the part of the invocation in the four sums of a splat of the batch.
+fn leave_four(k: u32, values: vec4f, lane: Lane) {
+    leave_from(k * SUMS * 64u + lane.local, values);
+}
+
+// In the ten sums.
+fn leave_ten(k: u32, first: vec4f, second: vec4f, third: vec2f, lane: Lane) {
+    let at = k * SUMS * 64u + lane.local;
+    leave_from(at, first);
+    leave_from(at + 256u, second);
+    partial_sums[at + 512u] = third.x;
+    partial_sums[at + 576u] = third.y;
+}
+
+fn leave_from(at: u32, values: vec4f) {
+    partial_sums[at] = values.x;
+    partial_sums[at + 64u] = values.y;
+    partial_sums[at + 128u] = values.z;
+    partial_sums[at + 192u] = values.w;
+}
+
+// Stores the sums of a batch. Every invocation must come here, and meet before sums are left again.
+fn store_sums(lane: Lane, count: u32, batch: u32) {
+    let own = lane.local / (64u / BATCH);
+    let part = lane.local % (64u / BATCH);
+    if (own < count && part < SUMS) {
+        pair_sums[staged[batch + own].pair * PAIR_SUMS + part] = sum_of(own * SUMS + part, lane.local);
+    }
+}
 
 // Over all invocations; `index` counts the sums of all splats.
 fn sum_of(index: u32, local: u32) -> f32 {

@@ -1,29 +1,31 @@
 // Walks the splats of a tile front to back as tile_forward does, and sums what reaches each of them over the pixels of the
 // tile. For BATCH splats at a time, invocations first sum over their own pixels and leave that in workgroup memory; then
 // each takes a sum of a splat over all invocations, in a fixed order: no atomics, one store per (tile, splat) pair and
-// sum. Sums by subgroups would take ten instructions where this takes a store and a load.
+// sum. Twin: tile_backward_by_pixels.wgsl.
 //
 // Beside what tile_forward asks for, the module binds `pair_sums`, and says what an invocation sums, `Sums`, which it
-// leaves by `leave`. `add` returns the responsibility of a splat for the label of a pixel: `begin_tile`, `longest_of_rows`
-// (0 for none), `keep_responsibility` and `sum_responsibilities` deal with those; `clear_row` with a pair that nothing
-// reaches.
+// leaves by `leave`. `add` returns the responsibility of a splat for the label of a pixel: `longest_of_rows` (0 for
+// none), `keep_responsibility` and `sum_responsibilities` deal with those, pixels counted by invocation and then by
+// quadrant, with the labels that `labels_at` says, where the module is `WITH_LABELS`; `clear_row` with a pair that nothing reaches.
 
 const BACKWARD: bool = true;
+const INVOCATIONS: u32 = 64u;
+#import workgroup
 #import tile_staging
 #import partial_sums
+#import batch_sums
 
-// Nothing reaches these pairs.
-fn clear_pairs(first: u32, end: u32) {
-    for (var index = first; index < end; index += 64u) {
-        let entry = entries[index];
-        for (var value = 0u; value < SUMS; value += 1u) {
-            pair_sums[entry.x * PAIR_SUMS + value] = 0.0;
-        }
-        clear_row(entry);
-    }
+// By invocation, 16 bits each, quadrants 0 and 1 first.
+var<workgroup> pixel_labels: array<vec2u, select(1u, 64u, WITH_LABELS)>;
+
+// Labels of the pixels of an invocation, by quadrant.
+fn labels_at(at: u32) -> vec4u {
+    let packed = pixel_labels[at];
+    return vec4u(packed & vec2u(0xffffu), packed >> vec2u(16u)).xzyw;
 }
 
-fn differentiate_tile(workgroup: vec3u, local: u32) {
+fn differentiate_tile(workgroup: vec3u, lane: Lane) {
+    let local = lane.local;
     let tile = vec2u(workgroup.x, view.first_row + workgroup.y);
     let range = tile_ranges[workgroup.y * view.tiles.x + workgroup.x];
     var p0 = pixel_of(tile, 0u, local);
@@ -31,9 +33,11 @@ fn differentiate_tile(workgroup: vec3u, local: u32) {
     var p2 = pixel_of(tile, 2u, local);
     var p3 = pixel_of(tile, 3u, local);
     let labels = vec4u(p0.label, p1.label, p2.label, p3.label);
-    begin_tile(labels, local);
+    if (WITH_LABELS) {
+        pixel_labels[local] = labels.xz | (labels.yw << vec2u(16u));
+    }
     for (var first = range.x; first < range.y; first += STAGED) {
-        let open = vec4u(p0.open, p1.open, p2.open, p3.open);
+        let open = p0.open | (p1.open << 2u) | (p2.open << 4u) | (p3.open << 6u);
         let alive = stage_tile(first, range.y, tile, open, local);
         if (alive == 0u) {
             clear_pairs(first + local, range.y);
@@ -66,8 +70,10 @@ fn differentiate_tile(workgroup: vec3u, local: u32) {
                 if ((passes & 192u) != 0u) {
                     responsibility.w = add(splat, values, 3u, (passes >> 6u) & 3u, behind, &p3, &sums);
                 }
-                leave(sums, k * SUMS * 64u + local);
-                keep_responsibility(responsibility, k * 64u + local);
+                leave(sums, k, lane);
+                for (var quadrant = 0u; quadrant < 4u; quadrant += 1u) {
+                    keep_responsibility(responsibility[quadrant], k, 4u * local + quadrant);
+                }
                 continuing {
                     k += 1u;
                     break if k >= count;
@@ -75,15 +81,7 @@ fn differentiate_tile(workgroup: vec3u, local: u32) {
             }
             workgroupBarrier();
 
-            let own = local / (64u / BATCH);
-            let part = local % (64u / BATCH);
-            if (own < count && part < SUMS) {
-                pair_sums[staged[batch + own].pair * PAIR_SUMS + part] = sum_of(own * SUMS + part, local);
-            }
-            workgroupBarrier();
-            if (longest_row > 0u) {
-                sum_responsibilities(own, part, local, count, batch, longest_row);
-            }
+            sum_batch(lane, count, batch, longest_row);
             continuing {
                 batch += BATCH;
                 break if batch >= staged_count;

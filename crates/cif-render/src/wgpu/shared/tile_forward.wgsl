@@ -1,9 +1,11 @@
-// Walks the splats of a tile front to back, for a workgroup with a pixel of each quadrant per invocation. The module says
+// Walks the splats of a tile front to back, for a workgroup with a pixel of each quadrant per invocation, so that what is
+// read of a splat serves four. Twin: tile_forward_by_pixels.wgsl. The module says
 // how a `Pixel` starts, `pixel_of`, and where it goes, `write`; what is read in addition to the staged splats,
 // `stage_more`; the values of a splat that is drawn, `values_of`; and what they do to a pixel of a quadrant, `add`, for
 // which `behind` is the position after the splat in the list of the tile.
 
 const BACKWARD: bool = false;
+const INVOCATIONS: u32 = 64u;
 #import tile_staging
 
 fn blend_tile(workgroup: vec3u, local: u32) {
@@ -15,7 +17,7 @@ fn blend_tile(workgroup: vec3u, local: u32) {
     var p3 = pixel_of(tile, 3u, local);
     let labels = vec4u(p0.label, p1.label, p2.label, p3.label);
     for (var first = range.x; first < range.y; first += STAGED) {
-        let open = vec4u(p0.open, p1.open, p2.open, p3.open);
+        let open = p0.open | (p1.open << 2u) | (p2.open << 4u) | (p3.open << 6u);
         let alive = stage_tile(first, range.y, tile, open, local);
         if (alive == 0u) {
             break;

@@ -1,5 +1,5 @@
 // Splats of a tile in workgroup memory, in order, with the quadrants that each pass draws them in: two bits per
-// quadrant, 0 and 1 above, 2 and 3 below. The module says which passes it draws, `drawn_passes`, and where the values of
+// quadrant, 0 and 1 above, 2 and 3 below. The walk declares INVOCATIONS, those of the workgroup. The module says which passes it draws, `drawn_passes`, and where the values of
 // a Gaussian begin and end, `row_range`; its own bindings follow those below.
 
 #import view
@@ -9,7 +9,7 @@
 @group(0) @binding(2) var<storage, read> entries: array<vec4u>;
 @group(0) @binding(3) var<storage, read> tile_ranges: array<vec2u>;
 
-const STAGED: u32 = 16u;
+const STAGED: u32 = INVOCATIONS / 4u;
 // Bits of the instance pass.
 const INSTANCE_IN_TILE: u32 = 170u;
 
@@ -36,9 +36,9 @@ var<workgroup> live: atomic<u32>;
 var<workgroup> longest: atomic<u32>;
 
 // Stages entries from `first` on; returns the passes that any pixel lets light through, of which `open` are those of the
-// invocation's pixels, a quadrant each. Every invocation of the workgroup must come here, and meet between what it reads
+// invocation's pixels, two bits per quadrant. Every invocation of the workgroup must come here, and meet between what it reads
 // and the next call.
-fn stage_tile(first: u32, end: u32, tile: vec2u, open: vec4u, local: u32) -> u32 {
+fn stage_tile(first: u32, end: u32, tile: vec2u, open: u32, local: u32) -> u32 {
     if (local < STAGED) {
         atomicStore(&staged_passes[local], 0u);
     }
@@ -47,7 +47,7 @@ fn stage_tile(first: u32, end: u32, tile: vec2u, open: vec4u, local: u32) -> u32
         atomicStore(&longest, 0u);
     }
     workgroupBarrier();
-    atomicOr(&live, open.x | (open.y << 2u) | (open.z << 4u) | (open.w << 6u));
+    atomicOr(&live, open);
     // An invocation decides one quadrant of an entry.
     let place = local / 4u;
     let quadrant = local % 4u;

@@ -23,6 +23,22 @@ fn sum_of_workgroup(lane: Lane, value: vec4f) -> vec4f {
     return sum;
 }
 
+// Place of the invocation; four from a multiple of four on are neighbours.
+fn place_in_workgroup(lane: Lane) -> u32 {
+    return lane.local;
+}
+
+// Sum over four neighbours, for each of them.
+fn sum_of_neighbours(lane: Lane, value: f32) -> f32 {
+    shared_sums[lane.local].x = value;
+    workgroupBarrier();
+    let first = lane.local & ~3u;
+    let sum = (shared_sums[first].x + shared_sums[first + 1u].x)
+        + (shared_sums[first + 2u].x + shared_sums[first + 3u].x);
+    workgroupBarrier();
+    return sum;
+}
+
 // Place of the invocation in the order of `before_in_workgroup`.
 fn rank_of(lane: Lane) -> u32 {
     return lane.local;

@@ -30,6 +30,18 @@ fn sum_of_workgroup(lane: Lane, value: vec4f) -> vec4f {
     return sum;
 }
 
+// Place of the invocation by subgroup and then within it, where all subgroups are full: four from a multiple of four on
+// are neighbours.
+fn place_in_workgroup(lane: Lane) -> u32 {
+    return lane.subgroup * (INVOCATIONS / lane.subgroups) + lane.place;
+}
+
+// Sum over four neighbours, for each of them.
+fn sum_of_neighbours(lane: Lane, value: f32) -> f32 {
+    let pair = value + subgroupShuffleXor(value, 1u);
+    return pair + subgroupShuffleXor(pair, 2u);
+}
+
 // Place of the invocation in the order of `before_in_workgroup`: by subgroup, then within it.
 fn rank_of(lane: Lane) -> u32 {
     let invocations = subgroupAdd(1u);

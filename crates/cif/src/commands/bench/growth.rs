@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use cif_geometry::stats::median;
-use cif_train::fit::{Grown, grown};
+use cif_train::fit::{Grown, filled, grown};
 use cif_train::metrics::training_config;
 use cif_train::{Preset, TrainConfig};
 use clap::Args;
@@ -24,7 +24,7 @@ const LIMIT: Duration = Duration::from_secs(3);
 Steps of the fine stage are measured with the Gaussians of the capture's points, or of a trained
 scene, thinned out or split until there are so many, and with images reduced as stated. Cells are
 medians, milliseconds per step; exponents are slopes of their logarithms, by least squares: 1 is
-proportional, 0 is no growth. Nothing is kept.
+proportional, 0 is no growth. Nothing is kept. On a GPU nothing counts pairs: evaluated_pairs is 0.
 
   cif bench growth captures/table --scene table.cif
   cif bench growth captures/table --gaussians 5000,50000,500000 --reductions 1,4 --json growth.json")]
@@ -45,6 +45,10 @@ pub(super) struct BenchGrowth {
     /// Share of the Gaussians that moves, percent
     #[arg(long, value_name = "PERCENT", default_value_t = 40, value_parser = clap::value_parser!(u8).range(0..=100))]
     moving: u8,
+    /// Backend that runs the steps
+    #[cfg(feature = "wgpu")]
+    #[arg(long, value_name = "BACKEND", default_value = "cpu")]
+    backend: crate::commands::backend::Backend,
     #[command(flatten)]
     report: ReportOption,
     /// Replace existing output
@@ -57,6 +61,8 @@ pub(super) struct BenchGrowth {
 /// Cost of a step by Gaussians and pixels.
 #[derive(Debug, Serialize)]
 struct Growth<'a> {
+    /// `processor`, or the name of the GPU.
+    engine: &'a str,
     /// Threads.
     threads: usize,
     /// All that was measured.
@@ -132,7 +138,9 @@ pub(super) fn run(command: &BenchGrowth) -> Result<(), Error> {
         Some(field) => command.capture_options.as_trained(field),
         None => command.capture_options.clone(),
     };
-    let (whole, mut cells) = (options.downscale, Vec::new());
+    #[cfg(feature = "wgpu")]
+    let gpu = command.backend.open()?;
+    let (whole, mut cells, mut engine) = (options.downscale, Vec::new(), String::new());
     for reduction in &command.reductions {
         options.downscale = match whole {
             None if *reduction == 1 => None,
@@ -147,15 +155,19 @@ pub(super) fn run(command: &BenchGrowth) -> Result<(), Error> {
         for gaussians in &command.gaussians {
             let moving = f64::from(command.moving) / 100.0;
             let count = *gaussians as usize;
-            let measured = grown(&dataset, &config, field.clone(), count, moving, LIMIT);
-            cells.push(Cell::of(&measured.map_err(Error::plain)?));
+            let mut trainer =
+                filled(&dataset, &config, field.clone(), count, moving).map_err(Error::plain)?;
+            #[cfg(feature = "wgpu")]
+            command.backend.apply(gpu.as_ref(), &mut trainer)?;
+            engine = trainer.gpu_name().unwrap_or("processor").to_owned();
+            cells.push(Cell::of(&grown(&mut trainer, LIMIT).map_err(Error::plain)?));
         }
     }
-    command.report.give(|| Growth::of(&cells), || Growth::of(&cells).print())
+    command.report.give(|| Growth::of(&cells, &engine), || Growth::of(&cells, &engine).print())
 }
 
 impl<'a> Growth<'a> {
-    fn of(cells: &'a [Cell]) -> Self {
+    fn of(cells: &'a [Cell], engine: &'a str) -> Self {
         let slopes = |same: &dyn Fn(&Cell) -> u64, other: &dyn Fn(&Cell) -> u64| {
             let mut all: Vec<u64> = cells.iter().map(same).collect();
             all.sort_unstable();
@@ -168,6 +180,7 @@ impl<'a> Growth<'a> {
         };
         let gaussians = |cell: &Cell| cell.gaussians as u64;
         Self {
+            engine,
             threads: rayon::current_num_threads(),
             by_gaussians: slopes(&Cell::pixels, &gaussians),
             by_pixels: slopes(&gaussians, &Cell::pixels),
@@ -197,7 +210,7 @@ impl<'a> Growth<'a> {
         last.extend(self.by_pixels.iter().map(|slope| shown(slope.exponent)));
         last.push(String::new());
         table.add_row(last);
-        println!("fine stage, {} threads, medians per step\n\n{table}", self.threads);
+        println!("fine stage, {}, {} threads, medians per step\n\n{table}", self.engine, self.threads);
     }
 }
 
@@ -216,11 +229,11 @@ mod tests {
         };
         let numbers = [100, 1_000, 10_000].into_iter();
         let cells: Vec<Cell> = numbers.flat_map(|n| [10, 20, 40].map(|width| cell(n, width))).collect();
-        let growth = Growth::of(&cells);
+        let growth = Growth::of(&cells, "processor");
         let all = |slopes: &[Slope], expected: f64| {
             slopes.len() == 3 && slopes.iter().all(|slope| (slope.exponent.unwrap() - expected).abs() < 1e-9)
         };
         assert!(all(&growth.by_gaussians, 0.5) && all(&growth.by_pixels, 2.0));
-        assert!(Growth::of(&cells[..1]).by_pixels[0].exponent.is_none());
+        assert!(Growth::of(&cells[..1], "processor").by_pixels[0].exponent.is_none());
     }
 }
