@@ -110,7 +110,7 @@ fn leave(sums: Sums, k: u32, lane: Lane) {
 const WITH_LABELS: bool = false;
 fn longest_of_rows() -> u32 { return 0u; }
 fn keep_responsibility(responsibility: f32, k: u32, pixel: u32) {}
-fn sum_responsibilities(local: u32, count: u32, batch: u32, longest_row: u32) {}
+fn sum_responsibilities(lane: Lane, count: u32, batch: u32, longest_row: u32) {}
 fn clear_row(entry: vec4u) {}
 
 @compute @workgroup_size(INVOCATIONS)

@@ -7,7 +7,7 @@ use cif_system::environment::GPU_NAME;
 
 use super::error::GpuError;
 use super::features::GpuFeatures;
-use super::form::{Form, SubgroupUse};
+use super::form::{Form, SMALLEST_SUBGROUP, SubgroupUse};
 
 /// Interfaces that are asked for GPUs. OpenGL is left out: its drivers are listed twice where Vulkan is there, and
 /// compute is optional in it.
@@ -223,6 +223,7 @@ impl Gpu {
         });
         let has_subgroups = device.features().contains(wgpu::Features::SUBGROUP);
         let subgroups = match (has_subgroups, facts.subgroups) {
+            (true, Some((smallest, _))) if smallest < SMALLEST_SUBGROUP => SubgroupUse::Small(smallest),
             (true, _) => SubgroupUse::Used,
             (false, Some(_)) if facts.software && features.subgroups => SubgroupUse::Software,
             (false, Some(_)) => SubgroupUse::HeldBack,

@@ -84,6 +84,9 @@ impl Form {
     }
 }
 
+/// Fewest invocations of a subgroup that kernels can do with: the neighbours that `partial_sums_by_subgroups.wgsl` adds over.
+pub const SMALLEST_SUBGROUP: u32 = 8;
+
 /// Use of subgroups on a device, or the reason against it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum SubgroupUse {
@@ -95,6 +98,8 @@ pub enum SubgroupUse {
     HeldBack,
     /// Software stands in for a GPU, and loops over them.
     Software,
+    /// They may have fewer invocations than [`SMALLEST_SUBGROUP`]: how many.
+    Small(u32),
     /// Known numbers came out wrong: what did.
     Wrong(String),
 }
@@ -107,6 +112,10 @@ impl std::fmt::Display for SubgroupUse {
             Self::HeldBack => f.write_str("not used, as CIF_GPU_FEATURES says"),
             Self::Software => f.write_str(
                 "not used, because software loops over them (CIF_GPU_FEATURES=all uses them all the same)",
+            ),
+            Self::Small(size) => write!(
+                f,
+                "not used, because they may have {size} invocations, and kernels add over {SMALLEST_SUBGROUP} neighbours"
             ),
             Self::Wrong(what) => write!(f, "not used, because this driver does not get them right: {what}"),
         }

@@ -14,7 +14,7 @@
 #import identity
 
 // Splats that are summed at a time, as many as workgroup memory holds, and their sums.
-const BATCH: u32 = select(4u, 2u, WITH_INSTANCES && INVOCATIONS > 64u);
+const BATCH: u32 = select(4u, 8u, INVOCATIONS > 64u && !WITH_INSTANCES);
 const SUMS: u32 = GRADIENT_SUMS;
 const WITH_LABELS: bool = WITH_INSTANCES;
 #import tile_backward
@@ -22,9 +22,7 @@ const WITH_LABELS: bool = WITH_INSTANCES;
 // Weighted r of every splat of the batch, by pixel.
 var<workgroup> responsibilities: array<f32, select(1u, BATCH * 256u, WITH_INSTANCES)>;
 // Invocations that sum the responsibilities of a splat.
-const PARTS: u32 = min(64u, INVOCATIONS / BATCH);
-// Where the sums of sixteen of them lie among the partial sums, behind those of all.
-const SIXTEENTHS: u32 = 4u * PARTS * BATCH;
+const PARTS: u32 = INVOCATIONS / BATCH;
 
 struct Pixel {
     centre: vec2f,
@@ -166,10 +164,10 @@ fn of_label(label: u32, labels: vec4u, values: vec4f) -> f32 {
 
 // Label mass of the batch, from the responsibilities of all invocations: of four entries of every row at a time. Every
 // invocation of the workgroup must come here.
-fn sum_responsibilities(local: u32, count: u32, batch: u32, longest_row: u32) {
-    let own = local / PARTS;
-    let part = local % PARTS;
-    let splat = min(batch + own, STAGED - 1u);
+fn sum_responsibilities(lane: Lane, count: u32, batch: u32, longest_row: u32) {
+    let own = place_in_workgroup(lane) / PARTS;
+    let part = place_in_workgroup(lane) % PARTS;
+    let splat = batch + own;
     var entry = 0u;
     loop {
         let row_first = staged[splat].row_first + entry;
@@ -206,28 +204,8 @@ fn sum_responsibilities(local: u32, count: u32, batch: u32, longest_row: u32) {
                 }
             }
         }
-        if (own < BATCH) {
-            partial_sums[4u * local] = mass.x;
-            partial_sums[4u * local + 1u] = mass.y;
-            partial_sums[4u * local + 2u] = mass.z;
-            partial_sums[4u * local + 3u] = mass.w;
-        }
-        workgroupBarrier();
-        // Of sixteen invocations, then of all.
-        if (own < BATCH && part < PARTS / 4u) {
-            var sum = 0.0;
-            let first = 4u * (PARTS * own + 16u * (part / 4u)) + part % 4u;
-            for (var k = 0u; k < 16u; k += 1u) {
-                sum += partial_sums[first + 4u * k];
-            }
-            partial_sums[SIXTEENTHS + PARTS / 4u * own + part] = sum;
-        }
-        workgroupBarrier();
+        let sum = sum_of_four(lane, own, part, mass);
         if (part < 4u && row_first + part < row_end) {
-            var sum = 0.0;
-            for (var k = part; k < PARTS / 4u; k += 4u) {
-                sum += partial_sums[SIXTEENTHS + PARTS / 4u * own + k];
-            }
             label_mass[staged[splat].slot + entry + part] = sum;
         }
         workgroupBarrier();

@@ -23,7 +23,7 @@ fn self_check(
     // Overflows shortly before the end.
     let large = before_in_workgroup(lane, 0x01010101u + rank);
     let place = place_in_workgroup(lane);
-    let neighbours = sum_of_neighbours(lane, f32(place));
+    let neighbours = sum_of_neighbours(lane, f32(place), 1u, 8u);
     found[3u * local] = bitcast<vec4u>(sum);
     found[3u * local + 1u] = vec4u(rank, small, large.x);
     found[3u * local + 2u] = vec4u(large.y, place, bitcast<u32>(neighbours), 0u);

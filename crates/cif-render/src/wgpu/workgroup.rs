@@ -90,8 +90,8 @@ fn differences(found: &[[u32; 4]]) -> Option<String> {
         }
         let expected = [before(rank, small), before(all, small), before(rank, large), before(all, large)];
         let place = rows[2][1];
-        // Four places from a multiple of four on.
-        let (of_neighbours, sum) = (f32::from_bits(rows[2][2]), (4 * (place & !3) + 6) as f32);
+        // Eight places from a multiple of eight on.
+        let (of_neighbours, sum) = (f32::from_bits(rows[2][2]), (8 * (place & !7) + 28) as f32);
         if of_neighbours != sum {
             return Some(format!("the sum of the neighbours of place {place} is {of_neighbours}, not {sum}"));
         }
@@ -128,7 +128,7 @@ mod tests {
                 let rank = (local * 37 + 11) % INVOCATIONS as u32;
                 let small = |rank: u32| 3 * (rank * rank.saturating_sub(1) / 2) + rank;
                 let counts = [rank, small(rank), small(INVOCATIONS as u32), below(rank)];
-                let of_neighbours = (4 * (local & !3) + 6) as f32;
+                let of_neighbours = (8 * (local & !7) + 28) as f32;
                 [sums, counts, [below(INVOCATIONS as u32), local, of_neighbours.to_bits(), 0]]
             })
             .collect();

@@ -211,13 +211,14 @@ fn images_of(scene: &SyntheticScene, time: f64, settings: &RenderSettings) -> Ve
     let (field, camera) = (&scene.field, &scene.camera);
     let of_level =
         |simd| (Path::Fast(simd), Renderer::new(simd).render(field, camera, time, settings, CHANNELS));
-    let mut all: Vec<(Path, RenderedImage)> = levels().into_iter().map(of_level).collect();
+    let of_gpu: Option<(Path, RenderedImage)> = None;
     #[cfg(feature = "wgpu")]
-    if let Some(device) = crate::on_gpu::device() {
+    let of_gpu = of_gpu.or_else(|| {
+        let device = crate::on_gpu::device()?;
         let mut renderer = cif_render::wgpu::GpuRenderer::new(&device.0, field).unwrap();
-        all.push((Path::Gpu, renderer.render(field, camera, time, settings, CHANNELS).unwrap()));
-    }
-    all
+        Some((Path::Gpu, renderer.render(field, camera, time, settings, CHANNELS).unwrap()))
+    });
+    levels().into_iter().map(of_level).chain(of_gpu).collect()
 }
 
 #[test]

@@ -279,6 +279,7 @@ const CONSTANTS: Snippet = Snippet {
             ("EPSILON", Constant::Float(EPSILON)),
             ("SMALLEST_SECOND", Constant::Float(f32::MIN_POSITIVE)),
             ("MIN_NORM", Constant::Float(MIN_NORM as f32)),
+            ("FLOAT_SPACING", Constant::Float(f32::EPSILON)),
             ("MIN_LABEL_PROBABILITY", Constant::Float(MIN_LABEL_PROBABILITY)),
             ("TILE", Constant::Unsigned(TILE)),
             ("INSTANCE_PASS", Constant::Unsigned(INSTANCE_PASS)),

@@ -27,8 +27,10 @@ const INVOCATIONS: u32 = 256u;
 // Sums of a pixel; leaves its gradient.
 fn compare(pixel: u32) -> vec4f {
     let difference = colors[pixel].xyz - unpack4x8unorm(targets[pixel]).xyz;
-    v_colors[pixel] = vec4f(settings.absolute_weight * sign(difference), 0.0);
     let absolute = abs(difference);
+    // Devices may unpack a byte to a number next to the nearest one: colours that differ by no more are equal.
+    let direction = select(sign(difference), vec3f(0.0), absolute <= vec3f(FLOAT_SPACING));
+    v_colors[pixel] = vec4f(settings.absolute_weight * direction, 0.0);
     var sums = vec4f(absolute.x + absolute.y + absolute.z, dot(difference, difference), 0.0, 0.0);
     if settings.with_instances != 0u {
         if labels[pixel] != 0u {

@@ -16,6 +16,6 @@ fn sum_batch(lane: Lane, count: u32, batch: u32, longest_row: u32) {
     store_sums(lane, count, batch);
     workgroupBarrier();
     if (longest_row > 0u) {
-        sum_responsibilities(lane.local, count, batch, longest_row);
+        sum_responsibilities(lane, count, batch, longest_row);
     }
 }

@@ -55,3 +55,21 @@ fn sum_of(index: u32, local: u32) -> f32 {
     }
     return (sum.x + sum.y) + (sum.z + sum.w);
 }
+
+// Sums of four values over the 64 / BATCH invocations that share a splat of the batch, `own`: that by number `part` for the
+// first four of them. Every invocation must come here, and meet before sums are left again.
+fn sum_of_four(lane: Lane, own: u32, part: u32, values: vec4f) -> f32 {
+    let at = 4u * lane.local;
+    partial_sums[at] = values.x;
+    partial_sums[at + 1u] = values.y;
+    partial_sums[at + 2u] = values.z;
+    partial_sums[at + 3u] = values.w;
+    workgroupBarrier();
+    var sum = 0.0;
+    if (part < 4u) {
+        for (var k = 0u; k < 64u / BATCH; k += 1u) {
+            sum += partial_sums[4u * (64u / BATCH * own + k) + part];
+        }
+    }
+    return sum;
+}

@@ -23,19 +23,20 @@ fn sum_of_workgroup(lane: Lane, value: vec4f) -> vec4f {
     return sum;
 }
 
-// Place of the invocation; four from a multiple of four on are neighbours.
+// Place of the invocation.
 fn place_in_workgroup(lane: Lane) -> u32 {
     return lane.local;
 }
 
-// Sum over four neighbours, for each of them.
-fn sum_of_neighbours(lane: Lane, value: f32) -> f32 {
-    shared_sums[lane.local].x = value;
-    workgroupBarrier();
-    let first = lane.local & ~3u;
-    let sum = (shared_sums[first].x + shared_sums[first + 1u].x)
-        + (shared_sums[first + 2u].x + shared_sums[first + 3u].x);
-    workgroupBarrier();
+// Sum over neighbours, for each of them: those whose places differ in the bits from `low` up to below `high`.
+fn sum_of_neighbours(lane: Lane, value: f32, low: u32, high: u32) -> f32 {
+    var sum = value;
+    for (var bit = low; bit < high; bit *= 2u) {
+        shared_sums[lane.local].x = sum;
+        workgroupBarrier();
+        sum += shared_sums[lane.local ^ bit].x;
+        workgroupBarrier();
+    }
     return sum;
 }
 

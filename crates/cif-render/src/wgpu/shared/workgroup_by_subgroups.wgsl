@@ -30,16 +30,19 @@ fn sum_of_workgroup(lane: Lane, value: vec4f) -> vec4f {
     return sum;
 }
 
-// Place of the invocation by subgroup and then within it, where all subgroups are full: four from a multiple of four on
-// are neighbours.
+// Place of the invocation by subgroup and then within it, where all subgroups are full: eight from a multiple of eight on
+// are of one subgroup.
 fn place_in_workgroup(lane: Lane) -> u32 {
     return lane.subgroup * (INVOCATIONS / lane.subgroups) + lane.place;
 }
 
-// Sum over four neighbours, for each of them.
-fn sum_of_neighbours(lane: Lane, value: f32) -> f32 {
-    let pair = value + subgroupShuffleXor(value, 1u);
-    return pair + subgroupShuffleXor(pair, 2u);
+// Sum over neighbours, for each of them: those whose places differ in the bits from `low` up to below `high`.
+fn sum_of_neighbours(lane: Lane, value: f32, low: u32, high: u32) -> f32 {
+    var sum = value;
+    for (var bit = low; bit < high; bit *= 2u) {
+        sum += subgroupShuffleXor(sum, bit);
+    }
+    return sum;
 }
 
 // Place of the invocation in the order of `before_in_workgroup`: by subgroup, then within it.
