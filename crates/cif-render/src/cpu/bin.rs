@@ -170,12 +170,74 @@ fn visit_tiles(splat: &Splat, region: &TileRegion, mut visit: impl FnMut(u32, u8
     }
 }
 
+/// Fewest splats of a chunk, and most chunks: each counts all tiles.
+const CHUNK: usize = 1024;
+const CHUNKS: usize = 64;
+
+/// Fewest tiles whose entries a task gathers.
+const TILES: usize = 16;
+
 /// Tiles of a chunk of splats.
 struct ReachedTiles {
     /// Tiles per splat.
     counts: Vec<u32>,
     /// Tiles of all splats in turn, and the passes that draw there, a bit each.
     reached: Vec<(u32, u8)>,
+    /// `[tiles]` pairs of each tile; once planned, the position of the first of them.
+    tiles: Vec<u32>,
+}
+
+/// The pairs of a chunk, sorted by tile.
+struct SortedPairs {
+    /// `[tiles + 1]` first entry of each tile.
+    offsets: Vec<u32>,
+    entries: Vec<TileEntry>,
+}
+
+impl ReachedTiles {
+    fn new(splats: &[Splat], region: &TileRegion) -> Self {
+        let mut counts = Vec::with_capacity(splats.len());
+        let mut reached = Vec::with_capacity(splats.len() * 3);
+        let mut tiles = vec![0; region.tiles()];
+        for splat in splats {
+            let before = reached.len();
+            visit_tiles(splat, region, |tile, passes| {
+                tiles[tile as usize] += 1;
+                reached.push((tile, passes));
+            });
+            counts.push((reached.len() - before) as u32);
+        }
+        Self { counts, reached, tiles }
+    }
+
+    /// Sorts the pairs by tile; `first_rank` is that of the first splat. The position of every pair among all goes to
+    /// `positions`, splat by splat, unless that is empty.
+    fn sorted(mut self, first_rank: u32, positions: &mut [u32]) -> SortedPairs {
+        let mut offsets = vec![0; self.tiles.len() + 1];
+        for (tile, _) in &self.reached {
+            offsets[*tile as usize + 1] += 1;
+        }
+        for tile in 0..self.tiles.len() {
+            offsets[tile + 1] += offsets[tile];
+        }
+        let mut entries = vec![TileEntry::default(); self.reached.len()];
+        // From the first of a tile here to the first of it among all.
+        for (among_all, own) in self.tiles.iter_mut().zip(&offsets) {
+            *among_all = among_all.wrapping_sub(*own);
+        }
+        let mut next = offsets.clone();
+        let ranks = (first_rank..).zip(&self.counts);
+        let ranks = ranks.flat_map(|(rank, count)| std::iter::repeat_n(rank, *count as usize));
+        for (pair, ((tile, passes), rank)) in self.reached.iter().zip(ranks).enumerate() {
+            let own = &mut next[*tile as usize];
+            entries[*own as usize] = TileEntry::new(rank, *passes);
+            if let Some(position) = positions.get_mut(pair) {
+                *position = own.wrapping_add(self.tiles[*tile as usize]);
+            }
+            *own += 1;
+        }
+        SortedPairs { offsets, entries }
+    }
 }
 
 impl TileLists {
@@ -195,22 +257,17 @@ impl TileLists {
         assert!(splats.len() < 1 << TileEntry::RANK_BITS, "more than 2^30 Gaussians are visible in one view");
 
         // Tiles of every splat, in chunks so that threads share the tests.
-        const CHUNK: usize = 1024;
+        let chunk_len = splats.len().div_ceil(CHUNKS).max(CHUNK);
         let pairs = AtomicU64::new(0);
-        let chunks: Vec<ReachedTiles> = splats
-            .par_chunks(CHUNK)
-            .map(|chunk| {
-                let (mut counts, mut reached) =
-                    (Vec::with_capacity(chunk.len()), Vec::with_capacity(chunk.len() * 3));
-                for splat in chunk {
-                    let before = reached.len();
-                    visit_tiles(splat, &region, |tile, passes| reached.push((tile, passes)));
-                    counts.push((reached.len() - before) as u32);
+        let mut chunks: Vec<ReachedTiles> = splats
+            .par_chunks(chunk_len)
+            .map(|splats| {
+                if pairs.load(Ordering::Relaxed) > limit {
+                    return ReachedTiles { counts: Vec::new(), reached: Vec::new(), tiles: Vec::new() };
                 }
-                if pairs.fetch_add(reached.len() as u64, Ordering::Relaxed) + reached.len() as u64 > limit {
-                    return ReachedTiles { counts: Vec::new(), reached: Vec::new() };
-                }
-                ReachedTiles { counts, reached }
+                let chunk = ReachedTiles::new(splats, &region);
+                pairs.fetch_add(chunk.reached.len() as u64, Ordering::Relaxed);
+                chunk
             })
             .collect();
         let pairs = pairs.into_inner();
@@ -224,40 +281,55 @@ impl TileLists {
         );
 
         self.tile_offsets.clear();
-        self.tile_offsets.resize(tiles + 1, 0);
-        for (tile, _) in chunks.iter().flat_map(|chunk| &chunk.reached) {
-            self.tile_offsets[*tile as usize + 1] += 1;
-        }
+        self.tile_offsets.reserve(tiles + 1);
+        let mut first = 0;
         for tile in 0..tiles {
-            self.tile_offsets[tile + 1] += self.tile_offsets[tile];
+            self.tile_offsets.push(first);
+            for chunk in &mut chunks {
+                let count = std::mem::replace(&mut chunk.tiles[tile], first);
+                first += count;
+            }
         }
-        let mut next: Vec<u32> = self.tile_offsets[..tiles].to_vec();
-        self.entries.clear();
-        self.entries.resize(pairs as usize, TileEntry::default());
+        self.tile_offsets.push(first);
         self.splat_offsets.clear();
         self.splat_pairs.clear();
         if by_splat {
+            let mut first = 0;
+            self.splat_offsets.reserve(splats.len() + 1);
             self.splat_offsets.push(0);
-            self.splat_pairs.reserve(pairs as usize);
+            self.splat_offsets.extend(chunks.iter().flat_map(|chunk| &chunk.counts).map(|count| {
+                first += count;
+                first
+            }));
+            self.splat_pairs.resize(pairs as usize, 0);
         }
-        let mut rank = 0;
-        for ReachedTiles { counts, reached } in chunks {
-            let mut reached = reached.iter();
-            for count in counts {
-                for (tile, passes) in reached.by_ref().take(count as usize) {
-                    let position = next[*tile as usize];
-                    next[*tile as usize] += 1;
-                    self.entries[position as usize] = TileEntry::new(rank, *passes);
-                    if by_splat {
-                        self.splat_pairs.push(position);
-                    }
-                }
-                if by_splat {
-                    self.splat_offsets.push(self.splat_pairs.len() as u32);
-                }
-                rank += 1;
+        let mut rest = &mut self.splat_pairs[..];
+        let mut tasks = Vec::with_capacity(chunks.len());
+        for (index, chunk) in chunks.into_iter().enumerate() {
+            let (positions, others) = rest.split_at_mut(if by_splat { chunk.reached.len() } else { 0 });
+            rest = others;
+            tasks.push(((index * chunk_len) as u32, chunk, positions));
+        }
+        let sorted =
+            tasks.into_par_iter().map(|(first_rank, chunk, positions)| chunk.sorted(first_rank, positions));
+        let sorted: Vec<SortedPairs> = sorted.collect();
+        self.entries.resize(pairs as usize, TileEntry::default());
+        let mut rest = &mut self.entries[..];
+        let mut tasks = Vec::with_capacity(tiles);
+        for tile in 0..tiles {
+            let len = self.tile_offsets[tile + 1] - self.tile_offsets[tile];
+            let (own, others) = rest.split_at_mut(len as usize);
+            rest = others;
+            tasks.push(own);
+        }
+        tasks.into_par_iter().enumerate().with_min_len(TILES).for_each(|(tile, mut own)| {
+            for chunk in &sorted {
+                let range = chunk.offsets[tile] as usize..chunk.offsets[tile + 1] as usize;
+                let (target, others) = own.split_at_mut(range.len());
+                target.copy_from_slice(&chunk.entries[range]);
+                own = others;
             }
-        }
+        });
     }
 
     /// True when every splat knows its pairs, as gradients ask for.

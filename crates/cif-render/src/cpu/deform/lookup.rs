@@ -183,8 +183,8 @@ impl<'a> PlanesAtTime<'a> {
     }
 
     /// Adds the gradients of chunks of `rows` to the planes: those by spatial values, `spatial_values()` for every
-    /// position, and those by lines, `line_values()` for every chunk. One task per plane visits the positions in order,
-    /// so sums do not depend on the number of threads.
+    /// position, and those by lines, `line_values()` for every chunk. One task per plane, or per band of its rows where there
+    /// are many threads, visits the positions in order, so sums do not depend on their number.
     pub(super) fn scatter(
         &self,
         simd_level: Level,
@@ -196,6 +196,8 @@ impl<'a> PlanesAtTime<'a> {
         let channels = self.channels;
         let mut rest = v_planes;
         let mut tasks = Vec::new();
+        let planes = SPATIAL.len() * self.levels.len();
+        let bands = (2 * rayon::current_num_threads()).div_ceil(planes);
         for (index, level) in self.levels.iter().enumerate() {
             for (plane, layout) in level.layouts.iter().enumerate() {
                 let (v_plane, tail) = rest.split_at_mut(layout.rows * layout.columns * channels);
@@ -204,18 +206,22 @@ impl<'a> PlanesAtTime<'a> {
                     self.scatter_line(&level.lines[line], level.line_offsets[line], lines, v_plane);
                 } else {
                     let slot = SPATIAL.iter().position(|(spatial, ..)| *spatial == plane);
-                    tasks.push((index, slot.expect("planes are spatial or temporal"), v_plane));
+                    let slot = slot.expect("planes are spatial or temporal");
+                    let rows = layout.rows.div_ceil(bands);
+                    let v_bands = v_plane.chunks_mut(rows * layout.columns * channels).enumerate();
+                    tasks.extend(v_bands.map(|(band, v_band)| (index, slot, band * rows, v_band)));
                 }
             }
         }
-        tasks.into_par_iter().for_each(|(index, slot, v_plane)| {
+        tasks.into_par_iter().for_each(|(index, slot, first_row, v_band)| {
             let mut rest = spatial;
             for positions in chunks {
                 let len = positions.len() * channels;
                 let (values, tail) = rest.split_at(positions.len() * self.spatial_values());
                 rest = tail;
                 let values = &values[(index * SPATIAL.len() + slot) * len..][..len];
-                dispatch!(simd_level, simd => scatter_plane(simd, self, index, slot, positions, values, v_plane));
+                dispatch!(simd_level, simd => scatter_plane(
+                    simd, self, [index, slot], first_row, positions, values, v_band));
             }
         });
     }
@@ -391,33 +397,41 @@ fn look_up_rows_backward<S: Simd>(
     }
 }
 
-/// Adds gradients by the values of one spatial plane, `[positions, channels]`, to its nodes.
+/// Adds gradients by the values of one spatial plane, `[positions, channels]`, to the nodes of a band of its rows, the first
+/// of which is `first_row`. The plane is that of a level in a slot.
 #[simd]
 fn scatter_plane<S: Simd>(
     simd: S,
     at: &PlanesAtTime<'_>,
-    level: usize,
-    slot: usize,
+    [level, slot]: [usize; 2],
+    first_row: usize,
     positions: &[[f32; 3]],
     values: &[f32],
-    v_plane: &mut [f32],
+    v_band: &mut [f32],
 ) {
     let channels = at.channels;
     let (plane, column_axis, row_axis) = SPATIAL[slot];
     let level = &at.levels[level];
     let next_row = level.layouts[plane].columns * channels;
+    let rows = v_band.len() / next_row;
     for (position, v) in positions.iter().zip(values.chunks_exact(channels)) {
-        let column = level.axes[column_axis].tap(position[column_axis]);
         let row = level.axes[row_axis].tap(position[row_axis]);
-        let (f, g) = (column.fraction, row.fraction);
-        let node = row.node * next_row + column.node * channels;
-        let (lower, upper) = v_plane[node..node + next_row + 2 * channels].split_at_mut(next_row);
-        for c in (0..channels).step_by(LANES) {
-            let v = load(simd, v, c);
-            add_scaled(simd, (1.0 - f) * (1.0 - g), v, &mut lower[..channels], c);
-            add_scaled(simd, f * (1.0 - g), v, &mut lower[channels..2 * channels], c);
-            add_scaled(simd, (1.0 - f) * g, v, &mut upper[..channels], c);
-            add_scaled(simd, f * g, v, &mut upper[channels..], c);
+        // Both rows of nodes, each where it is of the band.
+        if row.node + 1 < first_row || row.node >= first_row + rows {
+            continue;
+        }
+        let column = level.axes[column_axis].tap(position[column_axis]);
+        for (node, share) in [(row.node, 1.0 - row.fraction), (row.node + 1, row.fraction)] {
+            if node < first_row || node >= first_row + rows {
+                continue;
+            }
+            let start = (node - first_row) * next_row + column.node * channels;
+            let (left, right) = v_band[start..start + 2 * channels].split_at_mut(channels);
+            for c in (0..channels).step_by(LANES) {
+                let v = load(simd, v, c);
+                add_scaled(simd, (1.0 - column.fraction) * share, v, left, c);
+                add_scaled(simd, column.fraction * share, v, right, c);
+            }
         }
     }
 }

@@ -23,9 +23,19 @@ use self::network::{Activations, Network};
 /// Rows that go through the network together; sized so that activations stay in the second-level cache.
 const BLOCK: usize = 256;
 
-/// Rows that one task takes, in blocks: those whose weight gradients it sums, and those among which it looks for
-/// rows that move.
-const CHUNK: usize = 1024;
+/// Rows of a task of the forward pass, at least; up to [`BLOCK`].
+const FEWEST_ROWS: usize = 64;
+
+/// Rows whose weight gradients a task of the backward pass sums, in blocks, at least and at most: a task has an array of all
+/// weights.
+const SUMMED_ROWS: [usize; 2] = [128, 1024];
+
+/// Tasks that a pass is split into where there are enough rows: of the rows alone, so that sums do not depend on the number of
+/// threads.
+const TASKS: usize = 32;
+
+/// Weights whose gradients a task adds up over the tasks before.
+const SUMMED_WEIGHTS: usize = 1024;
 
 /// The deformation at one time.
 pub(super) struct DeformationAtTime<'a> {
@@ -82,36 +92,30 @@ impl<'a> DeformationAtTime<'a> {
     /// Fills `posed` with raw parameters at the time, deltas added to the rows that do not stand still.
     pub(super) fn forward(&self, level: Level, gaussians: &Gaussians, posed: &mut Gaussians) {
         begin(gaussians, self.network.has(HeadKind::Sh), posed);
-        let n = gaussians.len();
-        // Fewer rows of a chunk go through the network where many stand still.
-        let stands = self.deformation.still.contains(&true);
-        let chunk_rows = if stands { CHUNK } else { BLOCK };
-        gaussians
-            .means
-            .par_chunks(chunk_rows)
-            .zip(posed.rows_mut().chunks(chunk_rows, n))
-            .enumerate()
-            .for_each_init(Activations::default, |block, (chunk, (positions, mut posed))| {
-                let first = chunk * chunk_rows;
-                let rows: Vec<usize> =
-                    (0..positions.len()).filter(|row| !self.deformation.is_still(first + row)).collect();
-                let mut moving = Vec::with_capacity(BLOCK);
-                for rows in rows.chunks(BLOCK) {
-                    moving.clear();
-                    moving.extend(rows.iter().map(|row| positions[*row]));
-                    self.forward_block(level, &moving, block);
-                    for (kind, padded, output) in block.outputs(&self.network) {
-                        let target = posed.reborrow().into_tensor(&kind.parameter());
-                        let outputs = kind.outputs();
-                        for (row, output) in rows.iter().zip(output.chunks_exact(padded)) {
-                            let target = &mut target[row * outputs..(row + 1) * outputs];
-                            for (value, delta) in target.iter_mut().zip(output) {
-                                *value += delta;
-                            }
-                        }
+        let moving: Vec<usize> = (0..gaussians.len()).filter(|row| self.moves(*row)).collect();
+        let task_rows = moving.len().div_ceil(TASKS).clamp(FEWEST_ROWS, BLOCK);
+        // Each task has the rows of `posed` from behind those of the task before it.
+        let (mut tasks, mut rest, mut first) = (Vec::new(), posed.rows_mut(), 0);
+        for rows in moving.chunks(task_rows) {
+            let end = rows[rows.len() - 1] + 1;
+            let (own, others) = rest.split_at(end - first);
+            tasks.push((rows, first, own));
+            (rest, first) = (others, end);
+        }
+        tasks.into_par_iter().for_each_init(Activations::default, |block, (rows, first, mut posed)| {
+            let positions: Vec<[f32; 3]> = rows.iter().map(|row| gaussians.means[*row]).collect();
+            self.forward_block(level, &positions, block);
+            for (kind, padded, output) in block.outputs(&self.network) {
+                let target = posed.reborrow().into_tensor(&kind.parameter());
+                let outputs = kind.outputs();
+                for (row, output) in rows.iter().zip(output.chunks_exact(padded)) {
+                    let target = &mut target[(row - first) * outputs..][..outputs];
+                    for (value, delta) in target.iter_mut().zip(output) {
+                        *value += delta;
                     }
                 }
-            });
+            }
+        });
     }
 
     /// Adds gradients of planes, MLP and canonical centres (through the lookup) from the gradients of the
@@ -134,17 +138,19 @@ impl<'a> DeformationAtTime<'a> {
         positions.clear();
         positions.extend(active.iter().map(|row| gaussians.means[*row as usize]));
         v_positions.resize(active.len(), [0.0; 3]);
-        let chunks = active.len().div_ceil(CHUNK);
+        let [fewest, most] = SUMMED_ROWS;
+        let chunk_rows = active.len().div_ceil(TASKS).clamp(fewest, most);
+        let chunks = active.len().div_ceil(chunk_rows);
         let (values, lines, weights) =
             (self.planes.spatial_values(), self.planes.line_values(), self.network.layout.len);
         v_spatial.resize(active.len() * values, 0.0);
         v_lines.resize(chunks * lines, 0.0);
         v_weights.resize(chunks * weights, 0.0);
         active
-            .par_chunks(CHUNK)
-            .zip(positions.par_chunks(CHUNK))
-            .zip(v_positions.par_chunks_mut(CHUNK))
-            .zip(v_spatial.par_chunks_mut(CHUNK * values))
+            .par_chunks(chunk_rows)
+            .zip(positions.par_chunks(chunk_rows))
+            .zip(v_positions.par_chunks_mut(chunk_rows))
+            .zip(v_spatial.par_chunks_mut(chunk_rows * values))
             .zip(v_lines.par_chunks_mut(lines))
             .zip(v_weights.par_chunks_mut(weights))
             .for_each_init(
@@ -163,17 +169,18 @@ impl<'a> DeformationAtTime<'a> {
                     }
                 },
             );
-        for gradient in v_weights.chunks_exact(weights) {
-            for (total, value) in v_mlp.iter_mut().zip(gradient) {
-                *total += value;
+        v_mlp.par_chunks_mut(SUMMED_WEIGHTS).enumerate().for_each(|(part, totals)| {
+            for gradient in v_weights.chunks_exact(weights) {
+                let values = &gradient[part * SUMMED_WEIGHTS..];
+                totals.iter_mut().zip(values).for_each(|(total, value)| *total += value);
             }
-        }
+        });
         for (row, v_position) in active.iter().zip(&*v_positions) {
             for axis in 0..3 {
                 v_means[*row as usize][axis] += v_position[axis];
             }
         }
-        let chunks: Vec<&[[f32; 3]]> = positions.chunks(CHUNK).collect();
+        let chunks: Vec<&[[f32; 3]]> = positions.chunks(chunk_rows).collect();
         self.planes.scatter(level, &chunks, v_spatial, v_lines, v_planes);
     }
 }

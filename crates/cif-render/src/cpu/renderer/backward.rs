@@ -123,7 +123,7 @@ impl Renderer {
         let n = field.gaussians.len();
         let deformation =
             field.deformation.as_ref().filter(|_| settings.deform).map(|d| DeformationAtTime::new(d, time));
-        let mut v_posed = Gaussians::default();
+        let mut v_posed = std::mem::take(&mut self.v_posed);
         let with_gradient = timed(&mut times.project_backward, || {
             self.project_backward(field, &view, pairs, gradients, &mut v_posed)
         });
@@ -133,12 +133,14 @@ impl Renderer {
                 groups_backward(tracks, &at, time, &field.gaussians, &mut v_posed, gradients);
             });
         }
-        let total = gradients.gaussians.sh_coefficients.iter_mut();
-        for (row, (total, v)) in total.zip(&v_posed.sh_coefficients).enumerate() {
-            if has_posed_sh(field, row) {
-                total.iter_mut().zip(v).for_each(|(total, v)| *total += v);
-            }
-        }
+        timed(&mut times.project_backward, || {
+            let total = gradients.gaussians.sh_coefficients.par_iter_mut().with_min_len(CHUNK);
+            total.zip(&v_posed.sh_coefficients).enumerate().for_each(|(row, (total, v))| {
+                if has_posed_sh(field, row) {
+                    total.iter_mut().zip(v).for_each(|(total, v)| *total += v);
+                }
+            });
+        });
         self.inspection.look_at_posed_gradients(&v_posed, gradients);
         if let Some(deformation) = deformation {
             timed(&mut times.deform_backward, || {
@@ -170,6 +172,7 @@ impl Renderer {
             });
             self.inspection.look_at_deformation_gradients(gradients);
         }
+        self.v_posed = v_posed;
         self.times = times;
     }
 
@@ -287,7 +290,7 @@ impl Renderer {
             SH_COEFFICIENTS => moves_sh,
             _ => true,
         };
-        *v_posed = Gaussians::zeros_of(n, is_moved);
+        reset(v_posed, n, is_moved);
         let half = [view.width as f32 / 2.0, view.height as f32 / 2.0];
         let level = self.level;
         let rows = gradients.gaussians.rows_mut().chunks(CHUNK, n).into_par_iter();
@@ -412,6 +415,20 @@ impl Renderer {
         for (entry, value) in chunks.into_iter().flatten() {
             gradients.log_calibrations[entry] -= value;
         }
+    }
+}
+
+/// Makes gradients of `n` rows zero in the parameters that are moved; others have none. Memory that fits stays.
+fn reset(v: &mut Gaussians, n: usize, is_moved: impl Fn(&Parameter) -> bool) {
+    let fits = |(parameter, values): (Parameter, &[f32])| {
+        values.len() == if is_moved(&parameter) { n * parameter.width() } else { 0 }
+    };
+    if !v.tensors().into_iter().all(fits) {
+        *v = Gaussians::zeros_of(n, is_moved);
+        return;
+    }
+    for (_, values) in v.tensors_mut() {
+        values.par_chunks_mut(64 * CHUNK).for_each(|values| values.fill(0.0));
     }
 }
 

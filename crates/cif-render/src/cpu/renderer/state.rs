@@ -70,6 +70,8 @@ pub struct Renderer {
     pub(super) deform_scratch: DeformScratch,
     /// Memory of the gradients of (tile, splat) pairs, which would be cleared by the system in every step.
     pub(super) pair_gradients: Vec<SplatGradient>,
+    /// The same of gradients by posed parameters.
+    pub(super) v_posed: Gaussians,
     pub(super) band_memory: u64,
 }
 
@@ -97,6 +99,7 @@ impl Renderer {
             inspection: Inspection::default(),
             deform_scratch: DeformScratch::default(),
             pair_gradients: Vec::new(),
+            v_posed: Gaussians::default(),
             band_memory: BAND_MEMORY,
         }
     }
