@@ -1,5 +1,7 @@
 //! Contributions of Gaussians to training views, and to their errors.
 
+use cif_geometry::PixelGrid;
+
 /// Of every Gaussian, over a few training views.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Contributions {
@@ -34,4 +36,16 @@ impl Contributions {
         };
         Self { weight: pick(&self.weight), error: pick(&self.error) }
     }
+}
+
+/// Per pixel 1 and its error, `[height, width, 2]`: blended back to the Gaussians these are weights, and errors by them.
+pub(crate) fn ones_and_errors(rendered: &PixelGrid<[f32; 3]>, image: &PixelGrid<[u8; 3]>) -> Vec<f32> {
+    let pixels = rendered.pixels.iter().zip(&image.pixels);
+    pixels.flat_map(|(rendered, image)| [1.0, error(*rendered, *image)]).collect()
+}
+
+/// Mean absolute difference of the channels, in [0, 1] for colours in [0, 1].
+pub(crate) fn error(rendered: [f32; 3], image: [u8; 3]) -> f32 {
+    let differences = rendered.iter().zip(image).map(|(seen, image)| (seen - f32::from(image) / 255.0).abs());
+    differences.sum::<f32>() / 3.0
 }

@@ -12,7 +12,7 @@
 //! | `relocate` | relocation of Gaussians to instances that need them |
 
 pub mod adaptive;
-mod contributions;
+pub(crate) mod contributions;
 pub mod error_guided;
 pub(crate) mod growth;
 mod rearrangement;

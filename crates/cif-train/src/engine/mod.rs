@@ -98,6 +98,13 @@ pub(crate) trait Engine: Any + Send {
     /// When the engine fails.
     fn begin_changes(&mut self, state: &mut State, relocates: bool) -> Result<(), TrainError>;
 
+    /// Blending weights of every Gaussian over the pixels of a training view, and the errors of these by the same weights,
+    /// `[N, 2]`; see [`crate::density::Contributions`]. Nothing was changed since [`Self::begin_changes`].
+    ///
+    /// # Errors
+    /// When the engine fails, or the frame cannot be read.
+    fn sums_of_view(&mut self, state: &State, view: usize) -> Result<Vec<f32>, TrainError>;
+
     /// Moments of the Gaussians follow a change of their set.
     fn rearrange(&mut self, state: &mut State, change: &Rearrangement);
 

@@ -7,10 +7,11 @@ use std::time::Instant;
 use cif_field::Field;
 use cif_geometry::{PixelGrid, quaternion};
 use cif_render::cpu::{BlendWeightGradients, IdentityCounts, Renderer, SimdLevel};
-use cif_render::{BlendRequest, Channels, GeometryPath, Gradients, RenderSettings, RenderedImage};
+use cif_render::{BlendRequest, Blending, Channels, GeometryPath, Gradients, RenderSettings, RenderedImage};
 
 use super::{Changed, Engine, Views};
 use crate::density::Rearrangement;
+use crate::density::contributions::ones_and_errors;
 use crate::density::relocate::{Pair, Relocated};
 use crate::error::TrainError;
 use crate::guard::{Fault, exposure_fault, gradient_fault, loss_fault, value_fault};
@@ -302,6 +303,21 @@ impl Engine for Processor {
 
     fn begin_changes(&mut self, _state: &mut State, _relocates: bool) -> Result<(), TrainError> {
         Ok(())
+    }
+
+    fn sums_of_view(&mut self, state: &State, view: usize) -> Result<Vec<f32>, TrainError> {
+        let data = state.frames.get(&state.dataset, view)?;
+        let index = state.frames.index(view);
+        let (frame, settings) = (&state.dataset.frames[index], state.color_settings());
+        let mut color = self.renderer.forward(&state.field, &frame.camera, frame.time, &settings, None).color;
+        state.record_color(index, &mut color);
+        let cotangents = ones_and_errors(&color, &data.image);
+        // What is blended does not matter: gradients of values are sums of the weights.
+        let values = vec![0.0; 2 * state.field.gaussians.len()];
+        let request = BlendRequest { values: &values[..], channels: 2, blending: Blending::Color };
+        let mut sums = vec![0.0; values.len()];
+        self.renderer.blend_backward(&request, &cotangents, &mut sums, None);
+        Ok(sums)
     }
 
     fn rearrange(&mut self, state: &mut State, change: &Rearrangement) {

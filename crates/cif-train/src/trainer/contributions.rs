@@ -1,7 +1,5 @@
 //! Contributions of Gaussians to a few training views, for densification.
 
-use cif_render::cpu::Renderer;
-use cif_render::{BlendRequest, Blending};
 use rand::seq::index::sample;
 
 use super::Trainer;
@@ -10,12 +8,11 @@ use crate::error::TrainError;
 use crate::random::{Purpose, stream};
 
 impl Trainer {
-    /// Contributions to so many training views, which are drawn anew for every step. They are rendered on the processor,
-    /// so that runs on all engines take the same decisions from the same field.
+    /// Contributions to so many training views, which are drawn anew for every step.
     ///
     /// # Errors
-    /// When a frame cannot be read, or the run is to stop.
-    pub(super) fn contributions(&self, views: usize) -> Result<Contributions, TrainError> {
+    /// When the engine fails, a frame cannot be read, or the run is to stop.
+    pub(super) fn contributions(&mut self, views: usize) -> Result<Contributions, TrainError> {
         let state = &self.state;
         let (n, frames) = (state.field.gaussians.len(), state.frames.len());
         let mut rng = stream(state.config.seed, Purpose::Contributions, state.progress.total_steps);
@@ -23,58 +20,36 @@ impl Trainer {
         drawn.sort_unstable();
         state.frames.expect(drawn.iter().copied());
         let mut contributions = Contributions::zeros(n);
-        let mut renderer = Renderer::new(self.simd);
         for view in drawn {
             state.phases.check()?;
-            contributions.add_view(&self.sums_of_view(&mut renderer, view)?);
+            contributions.add_view(&self.engine.sums_of_view(state, view)?);
         }
         Ok(contributions)
     }
-
-    /// Blending weights of every Gaussian over the pixels of a training view, and errors by them, `[N, 2]`.
-    fn sums_of_view(&self, renderer: &mut Renderer, view: usize) -> Result<Vec<f32>, TrainError> {
-        let state = &self.state;
-        let data = state.frames.get(&state.dataset, view)?;
-        let index = state.frames.index(view);
-        let (frame, settings) = (&state.dataset.frames[index], state.color_settings());
-        let mut color = renderer.forward(&state.field, &frame.camera, frame.time, &settings, None).color;
-        state.record_color(index, &mut color);
-        let pixels = color.pixels.iter().zip(&data.image.pixels);
-        let cotangents: Vec<f32> = pixels.flat_map(|(seen, image)| [1.0, error(*seen, *image)]).collect();
-        // What is blended does not matter: gradients of values are sums of the weights.
-        let values = vec![0.0; 2 * state.field.gaussians.len()];
-        let request = BlendRequest { values: &values[..], channels: 2, blending: Blending::Color };
-        let mut sums = vec![0.0; values.len()];
-        renderer.blend_backward(&request, &cotangents, &mut sums, None);
-        Ok(sums)
-    }
-}
-
-/// Mean absolute difference of the channels, in [0, 1] for colours in [0, 1].
-fn error(rendered: [f32; 3], image: [u8; 3]) -> f32 {
-    let differences = rendered.iter().zip(image).map(|(seen, image)| (seen - f32::from(image) / 255.0).abs());
-    differences.sum::<f32>() / 3.0
 }
 
 #[cfg(test)]
 mod tests {
     use cif_render::Channels;
+    use cif_render::cpu::Renderer;
 
     use super::super::guard_tests::support::{Scene, capture, small_config, stopped_after};
     use super::*;
+    use crate::density::contributions::error;
 
     #[test]
     fn weights_add_up_to_coverage_and_errors_to_covered_errors() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = capture(folder.path(), Scene { times: 3, views: 4, ..Scene::default() });
-        let trainer = stopped_after(&dataset, &small_config(), 120);
-        let state = &trainer.state;
+        let mut trainer = stopped_after(&dataset, &small_config(), 120);
+        let Trainer { state, engine, simd, .. } = &mut trainer;
+        let state = &*state;
         let n = state.field.gaussians.len();
         let mut all = Contributions::zeros(n);
-        let mut renderer = Renderer::new(trainer.simd);
+        let mut renderer = Renderer::new(*simd);
         let sum = |values: &[f32]| values.iter().map(|value| f64::from(*value)).sum::<f64>();
         for view in 0..state.frames.len() {
-            let sums = trainer.sums_of_view(&mut renderer, view).unwrap();
+            let sums = engine.sums_of_view(state, view).unwrap();
             let mut of_view = Contributions::zeros(n);
             of_view.add_view(&sums);
             let frame = &state.dataset.frames[state.frames.index(view)];

@@ -14,6 +14,7 @@ use crate::clock::{Clock, Seconds};
 use crate::config::TrainConfig;
 use crate::density::DensifyStatistics;
 use crate::density::adaptive::Adaptive;
+use crate::density::error_guided::ErrorGuided;
 use crate::engine::Views;
 use crate::engine::gpu::GpuEngine;
 use crate::engine::processor::Processor;
@@ -257,6 +258,67 @@ fn rows_that_stay_on_the_device_end_as_those_that_the_host_rearranges() {
     assert!(on_device.0.0.gaussians == on_host.0.0.gaussians, "parameters");
     assert!(on_device.0.1 == on_host.0.1, "moments");
     assert!(on_device.0.2 == on_host.0.2, "statistics");
+}
+
+#[test]
+fn sets_that_grow_by_errors_stay_on_the_device() {
+    let Some(gpu) = testing::gpu() else { return };
+    let run = |fetches: bool| {
+        let (mut trainer, _folder) = trainer_with(Some(&gpu), |config| {
+            let densify = &mut config.densify;
+            (densify.from, densify.every, densify.until, densify.views) = (1, 3, 100, 4);
+            densify.max_gaussians *= 2;
+        });
+        trainer.set_density(Arc::new(ErrorGuided));
+        trainer.enter(Stage::Coarse).unwrap();
+        let mut split = Vec::new();
+        for _ in 0..6 {
+            if fetches {
+                device(&mut trainer).make_far_ahead();
+            }
+            let (stepped, events) = step(&mut trainer);
+            stepped.unwrap();
+            for event in events {
+                if let TrainEvent::Densified { split: count, gaussians, .. } = event {
+                    split.push((count, gaussians));
+                }
+            }
+            let is_ahead = device(&mut trainer).is_ahead();
+            assert_eq!(is_ahead, !fetches, "rows stay on the device unless they are fetched");
+        }
+        (state(&mut trainer), split)
+    };
+    let (on_device, on_host) = (run(false), run(true));
+    assert!(!on_device.1.is_empty() && on_device.1[0].0 > 0, "{:?}", on_device.1);
+    assert_eq!(on_device.1, on_host.1);
+    assert!(on_device.0 == on_host.0);
+}
+
+#[test]
+fn contributions_to_views_are_those_of_the_processor() {
+    let Some(gpu) = testing::gpu() else { return };
+    let (mut trainer, _folder) = trainer(Some(&gpu));
+    trainer.enter(Stage::Fine).unwrap();
+    for _ in 0..4 {
+        step(&mut trainer).0.unwrap();
+    }
+    trainer.fetch().unwrap();
+    let all = trainer.state.frames.len();
+    let of_views = |trainer: &mut Trainer| -> Vec<Vec<f32>> {
+        (0..all).map(|view| trainer.engine.sums_of_view(&trainer.state, view).unwrap()).collect()
+    };
+    let found = of_views(&mut trainer);
+    let expected = on_processor(&mut trainer, of_views);
+    assert_eq!(found.len(), all);
+    for (found, expected) in found.iter().zip(&expected) {
+        for channel in 0..2 {
+            let of = |sums: &[f32]| -> Vec<f32> { sums.iter().copied().skip(channel).step_by(2).collect() };
+            let (found, expected) = (of(found), of(expected));
+            let largest = expected.iter().copied().fold(0.0, f32::max);
+            let worst = found.iter().zip(&expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(largest > 0.0 && worst < 1e-4 * largest, "{channel}: {worst} of {largest}");
+        }
+    }
 }
 
 #[test]

@@ -189,8 +189,7 @@ impl Trainer {
         let falls = |what: Due| due.contains(&what);
         let effects = self.effects_at(Place::Behind, &self.done());
         let judges = effects.iter().any(|(_, due)| *due);
-        let looks = self.done().is_of_colors() && self.density.views(&self.done()) > 0;
-        if judges || looks || falls(Due::EstimateIdentities) || self.engine.is_far_ahead() {
+        if judges || falls(Due::EstimateIdentities) || self.engine.is_far_ahead() {
             self.fetch()?;
         }
         if self.state.progress.after_step == Some(AfterStep::Changes) {

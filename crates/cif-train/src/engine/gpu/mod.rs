@@ -15,9 +15,11 @@
 //! | `receive` | steps as they arrive: room for pairs, bad steps |
 //! | `diagnose` | where a bad step went wrong |
 //! | `rearrange` | changes of the set of Gaussians, with their rows staying there |
+//! | `contributions` | what Gaussians contribute to a view, for densification |
 //! | `draw` | views between steps |
 //! | `identities` | label mass for the identity stage |
 
+mod contributions;
 mod diagnose;
 mod draw;
 mod flight;
@@ -117,6 +119,10 @@ impl Engine for GpuEngine {
 
     fn begin_changes(&mut self, state: &mut State, relocates: bool) -> Result<(), TrainError> {
         self.take_basis(state, relocates)
+    }
+
+    fn sums_of_view(&mut self, state: &State, view: usize) -> Result<Vec<f32>, TrainError> {
+        self.contributions_to(state, view)
     }
 
     fn rearrange(&mut self, state: &mut State, change: &Rearrangement) {

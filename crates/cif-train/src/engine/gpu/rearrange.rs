@@ -1,6 +1,6 @@
 //! Densification, pruning, opacity resets and relocations with the rows staying on the device. The host decides as it
-//! does for itself, from geometry and statistics, 64 bytes of each Gaussian, and for relocations from the deformation
-//! and the calibrations, too; harmonics and moments, 672 bytes, are moved there.
+//! does for itself, from geometry and statistics, 64 bytes of each Gaussian, from exposures, and for relocations from the
+//! deformation and the calibrations, too; harmonics and moments, 672 bytes, are moved there.
 
 use cif_field::parameters::{LOG_CALIBRATIONS, OPACITY_LOGITS, OnCopy};
 use cif_render::wgpu::gaussians::{COLUMNS, gaussians, geometry, geometry_column};
@@ -21,6 +21,8 @@ struct Basis {
     deformation: Option<[Vec<f32>; 2]>,
     /// Calibrations, first and second moments.
     calibrations: Option<[Vec<f32>; 3]>,
+    /// Exposures with their moments.
+    exposures: Option<[Vec<f32>; 3]>,
 }
 
 impl GpuEngine {
@@ -28,7 +30,7 @@ impl GpuEngine {
     /// fetched last, until the next fetch.
     pub(super) fn take_basis(&mut self, state: &mut State, relocates: bool) -> Result<(), TrainError> {
         let Some(resident) = self.resident.as_ref().filter(|_| self.ahead) else { return Ok(()) };
-        let Basis { geometry, statistics, deformation, calibrations } =
+        let Basis { geometry, statistics, deformation, calibrations, exposures } =
             resident.basis(&self.gpu, relocates)?;
         if let Some(fetched) = &mut self.fetched
             && fetched.kept.is_none()
@@ -47,6 +49,9 @@ impl GpuEngine {
         if let (Some(target), Some([values, first, second])) = (&mut field.identities, calibrations) {
             target.log_calibrations = values;
             set_moments(&mut state.optimiser, &LOG_CALIBRATIONS, [first, second]);
+        }
+        if let (Some(target), Some(arrays)) = (&mut state.progress.exposures, exposures) {
+            [target.values, target.first, target.second] = arrays;
         }
         Ok(())
     }
@@ -93,6 +98,7 @@ impl Resident {
         Ok(Basis {
             geometry: self.canonical.geometry.read(gpu)?,
             statistics: self.statistics.read(gpu)?,
+            exposures: self.exposures.as_ref().map(|resident| resident.read(gpu)).transpose()?,
             deformation,
             calibrations,
         })
