@@ -1,4 +1,4 @@
-//! Long work while the interpreter goes on: it runs in a thread of its own, while the thread that asked for it answers
+//! Long work while the interpreter goes on: it runs in threads of its own, while the thread that asked for it answers
 //! signals and callbacks. So signals stay with the handlers that the program has, and Ctrl-C is a
 //! `KeyboardInterrupt`.
 
@@ -6,15 +6,14 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread;
 use std::time::Duration;
 
+use cif::workers;
 use pyo3::prelude::*;
 
+use crate::error::cif_error;
 use crate::process;
 
 /// Longest time between two looks at signals.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
-
-/// Stack of the thread that works: what main threads have.
-const STACK_BYTES: usize = 8 << 20;
 
 /// Where work asks questions; it waits for the answers.
 pub(crate) struct Questions<Q, A> {
@@ -44,8 +43,7 @@ pub(crate) fn run<T: Send, Q: Send, A: Send>(
         let (sender, inbox) = channel();
         let worker = thread::Builder::new()
             .name("cif".to_owned())
-            .stack_size(STACK_BYTES)
-            .spawn_scoped(scope, move || work(Questions { sender }))?;
+            .spawn_scoped(scope, move || workers::run(None, move || work(Questions { sender })))?;
         let mut inbox: Receiver<(Q, Sender<A>)> = inbox;
         let mut failure = None;
         loop {
@@ -68,7 +66,7 @@ pub(crate) fn run<T: Send, Q: Send, A: Send>(
             }
         }
         match py.detach(|| worker.join()) {
-            Ok(done) => failure.map_or(Ok(done), Err),
+            Ok(done) => failure.map_or_else(|| done.map_err(cif_error), Err),
             Err(panic) => std::panic::resume_unwind(panic),
         }
     })

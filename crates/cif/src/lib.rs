@@ -62,6 +62,7 @@ pub mod starting_points;
 pub mod training;
 mod version;
 pub mod words;
+pub mod workers;
 
 use std::ffi::OsString;
 use std::io::IsTerminal;

@@ -145,16 +145,7 @@ impl Arguments {
 /// Whatever keeps the command from doing what was asked.
 pub fn run(arguments: Arguments) -> Result<(), Error> {
     messages::set_quiet(arguments.quiet);
-    let run = || dispatch(arguments.command);
-    match arguments.machine.threads {
-        None => run(),
-        // A pool of its own, because the command may run several times in one process.
-        Some(threads) => rayon::ThreadPoolBuilder::new()
-            .num_threads(threads as usize)
-            .build()
-            .map_err(|error| Error::plain(format!("cannot start {threads} threads: {error}")))?
-            .install(run),
-    }
+    crate::workers::run(arguments.machine.threads, || dispatch(arguments.command))?
 }
 
 /// Advice on arguments that were not understood, where the message of the parser has none.
