@@ -1,25 +1,36 @@
 //! The Gaussians of a view by row, at its time.
 
-use cif_field::Gaussians;
 use cif_field::gaussians::SH_FLOATS;
+use cif_field::{Field, Gaussians};
 
 use super::pixels::Lanes;
 
 /// Posed parameters by row, falling back to the canonical ones where nothing moves.
 pub(super) struct PosedView<'a> {
-    canonical: &'a Gaussians,
+    field: &'a Field,
     moved: &'a Gaussians,
 }
 
+/// True for rows whose colours may be moved: by the deformation, or by the pose of their group.
+pub(super) fn has_posed_colors(field: &Field, row: usize) -> bool {
+    deforms_colors(field) || field.tracks.as_ref().is_some_and(|tracks| tracks.group(row).is_some())
+}
+
+/// True when a deformation may move the colours of every row.
+pub(super) fn deforms_colors(field: &Field) -> bool {
+    field.deformation.as_ref().is_some_and(|deformation| deformation.config.heads.sh)
+}
+
 impl<'a> PosedView<'a> {
-    pub(super) fn new(canonical: &'a Gaussians, moved: &'a Gaussians) -> Self {
-        Self { canonical, moved }
+    /// Of a field, and what `pose` made of it.
+    pub(super) fn new(field: &'a Field, moved: &'a Gaussians) -> Self {
+        Self { field, moved }
     }
 
     /// Raw parameters of a Gaussian: mean, log-scale, quaternion, logits of opacity and occupancy, then zeros.
     #[inline(always)]
     pub(super) fn row(&self, row: usize) -> Lanes {
-        let (canonical, moved) = (self.canonical, self.moved);
+        let (canonical, moved) = (&self.field.gaussians, self.moved);
         let occupancy = *moved.occupancy_logits.get(row).unwrap_or(&canonical.occupancy_logits[row]);
         let from = if moved.means.is_empty() { canonical } else { moved };
         let ([x, y, z], [sx, sy, sz]) = (from.means[row], from.log_scales[row]);
@@ -30,6 +41,9 @@ impl<'a> PosedView<'a> {
     /// Coefficients of spherical harmonics of a Gaussian.
     #[inline(always)]
     pub(super) fn sh(&self, row: usize) -> &'a [f32; SH_FLOATS] {
-        self.moved.sh_coefficients.get(row).unwrap_or(&self.canonical.sh_coefficients[row])
+        match self.moved.sh_coefficients.get(row) {
+            Some(sh) if has_posed_colors(self.field, row) => sh,
+            _ => &self.field.gaussians.sh_coefficients[row],
+        }
     }
 }

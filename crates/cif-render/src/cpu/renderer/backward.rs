@@ -10,7 +10,7 @@ use super::super::deform::DeformationAtTime;
 use super::super::groups::groups_backward;
 use super::super::labels::{IdentityRows, TileLabels};
 use super::super::pixels::LANES;
-use super::super::posed::PosedView;
+use super::super::posed::{PosedView, has_posed_colors};
 use super::super::project::ViewConstants;
 use super::super::project_backward::{DrawnGaussians, PosedGradient, SplatGradient, project_backward};
 use super::super::rasterize::TileImage;
@@ -136,7 +136,7 @@ impl Renderer {
         timed(&mut times.project_backward, || {
             let total = gradients.gaussians.sh_coefficients.par_iter_mut().with_min_len(CHUNK);
             total.zip(&v_posed.sh_coefficients).enumerate().for_each(|(row, (total, v))| {
-                if has_posed_sh(field, row) {
+                if has_posed_colors(field, row) {
                     total.iter_mut().zip(v).for_each(|(total, v)| *total += v);
                 }
             });
@@ -283,14 +283,14 @@ impl Renderer {
         let n = field.gaussians.len();
         let rank_of = self.ranks(n);
         let sums = self.splat_sums(pairs);
-        let posed = PosedView::new(&field.gaussians, &tape.posed);
+        let posed = PosedView::new(field, &tape.posed);
         let moves_sh = !tape.posed.sh_coefficients.is_empty();
         let is_moved = |parameter: &Parameter| match *parameter {
             OCCUPANCY_LOGITS => false,
             SH_COEFFICIENTS => moves_sh,
             _ => true,
         };
-        reset(v_posed, n, is_moved);
+        reset(v_posed, field, is_moved);
         let half = [view.width as f32 / 2.0, view.height as f32 / 2.0];
         let level = self.level;
         let rows = gradients.gaussians.rows_mut().chunks(CHUNK, n).into_par_iter();
@@ -322,7 +322,7 @@ impl Renderer {
                     let posed_gradients = dispatch!(level, simd => project_backward(simd, view, &drawn));
                     for (lane, (row, splat, v)) in found.iter().enumerate() {
                         let (row, gaussian) = (*row, splat.gaussian as usize);
-                        let sh = if moves_sh && has_posed_sh(field, gaussian) {
+                        let sh = if moves_sh && has_posed_colors(field, gaussian) {
                             &mut of_view.sh_coefficients[row]
                         } else {
                             &mut total.sh_coefficients[row]
@@ -418,8 +418,10 @@ impl Renderer {
     }
 }
 
-/// Makes gradients of `n` rows zero in the parameters that are moved; others have none. Memory that fits stays.
-fn reset(v: &mut Gaussians, n: usize, is_moved: impl Fn(&Parameter) -> bool) {
+/// Makes gradients of posed Gaussians zero, in the parameters that are moved; others have none. Colours that do not move keep
+/// what they have, which nothing reads; memory that fits stays.
+fn reset(v: &mut Gaussians, field: &Field, is_moved: impl Fn(&Parameter) -> bool) {
+    let n = field.gaussians.len();
     let fits = |(parameter, values): (Parameter, &[f32])| {
         values.len() == if is_moved(&parameter) { n * parameter.width() } else { 0 }
     };
@@ -427,15 +429,11 @@ fn reset(v: &mut Gaussians, n: usize, is_moved: impl Fn(&Parameter) -> bool) {
         *v = Gaussians::zeros_of(n, is_moved);
         return;
     }
-    for (_, values) in v.tensors_mut() {
+    let colors = v.sh_coefficients.par_iter_mut().with_min_len(CHUNK).enumerate();
+    colors.filter(|(row, _)| has_posed_colors(field, *row)).for_each(|(_, v)| v.fill(0.0));
+    for (_, values) in v.tensors_mut().into_iter().filter(|(parameter, _)| *parameter != SH_COEFFICIENTS) {
         values.par_chunks_mut(64 * CHUNK).for_each(|values| values.fill(0.0));
     }
-}
-
-/// True for rows whose colours may be moved: by the deformation, or by the pose of their group.
-fn has_posed_sh(field: &Field, row: usize) -> bool {
-    field.deformation.as_ref().is_some_and(|deformation| deformation.config.heads.sh)
-        || field.tracks.as_ref().is_some_and(|tracks| tracks.group(row).is_some())
 }
 
 /// Gradients of the colour loss by the colours of a tile's pixels.

@@ -5,6 +5,7 @@ use cif_field::tracks::TracksAtTime;
 use cif_field::{Field, Gaussians};
 
 use super::super::deform::DeformationAtTime;
+use super::super::posed::has_posed_colors;
 use super::pose::pose;
 use super::state::Renderer;
 use crate::Gradients;
@@ -30,6 +31,12 @@ impl Renderer {
         let deformation =
             field.deformation.as_ref().map(|deformation| DeformationAtTime::new(deformation, time));
         pose(self.level, field, deformation, tracks, ALL_DEGREES, &mut posed);
+        let (colors, canonical) = (posed.sh_coefficients.iter_mut(), &field.gaussians.sh_coefficients);
+        for (row, (posed, canonical)) in colors.zip(canonical).enumerate() {
+            if !has_posed_colors(field, row) {
+                *posed = *canonical;
+            }
+        }
         posed.or(&field.gaussians)
     }
 

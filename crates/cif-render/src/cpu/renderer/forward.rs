@@ -89,7 +89,7 @@ impl Renderer {
             deformed = deformation.map_or(0, |deformation| deformation.moving_rows(field.len()).count());
         });
         timed(&mut times.project, || {
-            let posed = PosedView::new(&field.gaussians, &tape.posed);
+            let posed = PosedView::new(field, &tape.posed);
             let n = field.gaussians.len();
             let chunks: Vec<Vec<Splat>> = (0..n.div_ceil(CHUNK))
                 .into_par_iter()
