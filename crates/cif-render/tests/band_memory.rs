@@ -72,7 +72,7 @@ fn large_splats_take_the_memory_of_a_band() {
     // Beside the band: the splats, twice while they are put in order, and what the allocator keeps.
     let splats = 2 * 2000 * 100;
     assert!(taken < BAND + splats + (4 << 20), "{taken} bytes for bands of {BAND}");
-    // At once, lists of 12 bytes a pair and pixels of 45 bytes are there together.
+    // At once, 8 bytes of every pair are there together, before the lists are.
     let (taken, ..) = draw(&scene, u64::MAX);
-    assert!(taken > 24 << 20, "{taken} bytes at once");
+    assert!(taken > 8 * pairs as u64, "{taken} bytes at once");
 }

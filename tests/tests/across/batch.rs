@@ -154,8 +154,12 @@ fn a_job_of_a_killed_worker_goes_on_elsewhere_from_what_was_saved() {
     let mut worker = Background::start(CIF, path, "batch plan.toml --job train");
     worker.until(|| scene.exists());
     // As when a machine goes down: the worker and its training at once.
-    let children =
-        fs::read_to_string(format!("/proc/{0}/task/{0}/children", worker.id())).unwrap_or_default();
+    let threads = fs::read_dir(format!("/proc/{}/task", worker.id())).unwrap();
+    let of_thread = |thread: std::io::Result<fs::DirEntry>| {
+        fs::read_to_string(thread.unwrap().path().join("children")).unwrap_or_default()
+    };
+    let children: String = threads.map(of_thread).collect();
+    assert!(!children.is_empty(), "the training is a child of the worker");
     drop(worker);
     for child in children.split_whitespace() {
         let _ = std::process::Command::new("kill").args(["-KILL", child]).status();

@@ -1,6 +1,6 @@
 // Blends four channels of values per Gaussian over the pixels of a tile, front to back, with the weights of colour or of
-// instances. A workgroup is a tile, an invocation one of its pixels, or one of each quadrant. Rust twin: cpu/blend.rs. Source:
-// methods reference 3.1 (pixel loop) and 4.1.
+// instances. A workgroup is a tile, an invocation one of its pixels, or one of each quadrant. Rust twin: cpu/blend.rs.
+// Source: methods reference 3.1 (pixel loop) and 4.1.
 
 #import constants
 @group(0) @binding(6) var<storage, read_write> blended: array<f32>;

@@ -1,7 +1,8 @@
 // Blends the splats of a tile into pixels, front to back, for colour and for the probability of each pixel's own label
-// at once. A workgroup is a tile, an invocation one of its pixels, or one of each quadrant. Writes the composited colour with the transmittance, and depth D, label probability M_y, instance transmittance
-// S and the position in the list of the tile after the last splat that supports the label. Rust twin: cpu/rasterize.rs.
-// Source: methods reference 3.1 (pixel loop) and 4.2.
+// at once. A workgroup is a tile, an invocation one of its pixels, or one of each quadrant. Writes the composited colour
+// with the transmittance, and depth D, label probability M_y, instance transmittance S and the position in the list of
+// the tile after the last splat that supports the label. Rust twin: cpu/rasterize.rs. Source: methods reference 3.1
+// (pixel loop) and 4.2.
 
 #import constants
 #import variant

@@ -312,7 +312,7 @@ impl Engine for Processor {
         let mut color = self.renderer.forward(&state.field, &frame.camera, frame.time, &settings, None).color;
         state.record_color(index, &mut color);
         let cotangents = ones_and_errors(&color, &data.image);
-        // What is blended does not matter: gradients of values are sums of the weights.
+        // Any values do: their gradients are sums of the weights.
         let values = vec![0.0; 2 * state.field.gaussians.len()];
         let request = BlendRequest { values: &values[..], channels: 2, blending: Blending::Color };
         let mut sums = vec![0.0; values.len()];

@@ -17,8 +17,8 @@ const START_OUTPUT: u32 = 2u;
 
 var<workgroup> activations: array<vec4<f32>, ACTIVATION_QUADS>;
 
-// Whether a thread multiplies two vectors of Gaussians at a time, which share the weights that are read, or one, which
-// leaves no thread idle where a workgroup has few Gaussians.
+// True where a thread multiplies two vectors of Gaussians at a time, which share the weights that are read; one leaves no
+// thread idle where a workgroup has few Gaussians.
 const IN_PAIRS: bool = ROW_QUADS * WIDTH_QUADS >= 2u * THREADS;
 
 // Four columns of a vector of Gaussians, or of two.

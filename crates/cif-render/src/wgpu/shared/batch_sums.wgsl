@@ -1,4 +1,4 @@
-// What the two walks of the backward pass share: the sums of a batch of splats over the workgroup, and pairs without any.
+// Shared by both walks of the backward pass: sums of a batch of splats over the workgroup, and pairs without any.
 
 // Nothing reaches these pairs.
 fn clear_pairs(first: u32, end: u32) {

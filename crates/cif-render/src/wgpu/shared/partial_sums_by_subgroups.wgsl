@@ -1,5 +1,5 @@
-// Sums over the 256 invocations of a workgroup: over eight neighbours of a subgroup first, each of which ends with one or two
-// of the sums, then through workgroup memory. The module declares BATCH and SUMS, 4 or 10. Twin: partial_sums.wgsl.
+// Sums over the 256 invocations of a workgroup: over eight neighbours of a subgroup first, each of which ends with one or
+// two of the sums, then through workgroup memory. The module declares BATCH and SUMS, 4 or 10. Twin: partial_sums.wgsl.
 
 // Of every splat of the batch and sum, by eight invocations.
 var<workgroup> partial_sums: array<f32, BATCH * SUMS * 32u>;

@@ -6,7 +6,8 @@
 // Beside what tile_forward asks for, the module binds `pair_sums`, and says what an invocation sums, `Sums`, which it
 // leaves by `leave`. `add` returns the responsibility of a splat for the label of a pixel: `longest_of_rows` (0 for
 // none), `keep_responsibility` and `sum_responsibilities` deal with those, pixels counted by invocation and then by
-// quadrant, with the labels that `labels_at` says, where the module is `WITH_LABELS`; `clear_row` with a pair that nothing reaches.
+// quadrant, with the labels that `labels_at` says, where the module is `WITH_LABELS`; `clear_row` with a pair that nothing
+// reaches.
 
 const BACKWARD: bool = true;
 const INVOCATIONS: u32 = 64u;

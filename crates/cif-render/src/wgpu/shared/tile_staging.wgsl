@@ -1,6 +1,7 @@
 // Splats of a tile in workgroup memory, in order, with the quadrants that each pass draws them in: two bits per
-// quadrant, 0 and 1 above, 2 and 3 below. The walk declares INVOCATIONS, those of the workgroup. The module says which passes it draws, `drawn_passes`, and where the values of
-// a Gaussian begin and end, `row_range`; its own bindings follow those below.
+// quadrant, 0 and 1 above, 2 and 3 below. The walk declares INVOCATIONS, those of the workgroup. The module says which
+// passes it draws, `drawn_passes`, and where the values of a Gaussian begin and end, `row_range`; its own bindings follow
+// those below.
 
 #import view
 #import splat
@@ -36,8 +37,8 @@ var<workgroup> live: atomic<u32>;
 var<workgroup> longest: atomic<u32>;
 
 // Stages entries from `first` on; returns the passes that any pixel lets light through, of which `open` are those of the
-// invocation's pixels, two bits per quadrant. Every invocation of the workgroup must come here, and meet between what it reads
-// and the next call.
+// invocation's pixels, two bits per quadrant. Every invocation of the workgroup must come here, and meet between what it
+// reads and the next call.
 fn stage_tile(first: u32, end: u32, tile: vec2u, open: u32, local: u32) -> u32 {
     if (local < STAGED) {
         atomicStore(&staged_passes[local], 0u);

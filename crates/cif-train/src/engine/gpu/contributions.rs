@@ -35,7 +35,7 @@ impl GpuEngine {
         let mut color = PixelGrid { width, height, pixels: pixels.collect() };
         state.record_color(index, &mut color);
         let cotangents = GpuVec::from_slice(gpu, "ones and errors", &ones_and_errors(&color, &data.image))?;
-        // What is blended does not matter: gradients of values are sums of the weights.
+        // Any values do: their gradients are sums of the weights.
         let numbers = CHANNELS * resident.canonical.len();
         let values = GpuVec::zeros(gpu, "values of contributions", numbers)?;
         let sums = GpuVec::zeros(gpu, "contributions", numbers)?;
