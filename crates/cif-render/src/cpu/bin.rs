@@ -170,21 +170,24 @@ fn visit_tiles(splat: &Splat, region: &TileRegion, mut visit: impl FnMut(u32, u8
     }
 }
 
-/// Fewest splats of a chunk, and most chunks: each counts all tiles.
+/// Fewest splats of a chunk, and most chunks, four for each of sixteen threads: each counts all tiles.
 const CHUNK: usize = 1024;
 const CHUNKS: usize = 64;
 
-/// Fewest tiles whose entries a task gathers.
+/// Fewest tiles whose entries a task gathers, as many as a row of an image of 256 pixels has.
 const TILES: usize = 16;
 
 /// Tiles of a chunk of splats.
+#[derive(Default)]
 struct ReachedTiles {
     /// Tiles per splat.
     counts: Vec<u32>,
     /// Tiles of all splats in turn, and the passes that draw there, a bit each.
     reached: Vec<(u32, u8)>,
-    /// `[tiles]` pairs of each tile; once planned, the position of the first of them.
+    /// `[tiles]` pairs of each tile.
     tiles: Vec<u32>,
+    /// `[tiles]` position of the first of them among the pairs of all chunks; empty before it is known.
+    firsts: Vec<u32>,
 }
 
 /// The pairs of a chunk, sorted by tile.
@@ -207,32 +210,27 @@ impl ReachedTiles {
             });
             counts.push((reached.len() - before) as u32);
         }
-        Self { counts, reached, tiles }
+        Self { counts, reached, tiles, firsts: Vec::new() }
     }
 
     /// Sorts the pairs by tile; `first_rank` is that of the first splat. The position of every pair among all goes to
     /// `positions`, splat by splat, unless that is empty.
-    fn sorted(mut self, first_rank: u32, positions: &mut [u32]) -> SortedPairs {
-        let mut offsets = vec![0; self.tiles.len() + 1];
-        for (tile, _) in &self.reached {
-            offsets[*tile as usize + 1] += 1;
-        }
-        for tile in 0..self.tiles.len() {
-            offsets[tile + 1] += offsets[tile];
+    fn sorted(self, first_rank: u32, positions: &mut [u32]) -> SortedPairs {
+        let mut offsets = Vec::with_capacity(self.tiles.len() + 1);
+        offsets.push(0);
+        for (tile, count) in self.tiles.iter().enumerate() {
+            offsets.push(offsets[tile] + count);
         }
         let mut entries = vec![TileEntry::default(); self.reached.len()];
-        // From the first of a tile here to the first of it among all.
-        for (among_all, own) in self.tiles.iter_mut().zip(&offsets) {
-            *among_all = among_all.wrapping_sub(*own);
-        }
         let mut next = offsets.clone();
         let ranks = (first_rank..).zip(&self.counts);
         let ranks = ranks.flat_map(|(rank, count)| std::iter::repeat_n(rank, *count as usize));
         for (pair, ((tile, passes), rank)) in self.reached.iter().zip(ranks).enumerate() {
-            let own = &mut next[*tile as usize];
+            let tile = *tile as usize;
+            let own = &mut next[tile];
             entries[*own as usize] = TileEntry::new(rank, *passes);
             if let Some(position) = positions.get_mut(pair) {
-                *position = own.wrapping_add(self.tiles[*tile as usize]);
+                *position = self.firsts[tile] + (*own - offsets[tile]);
             }
             *own += 1;
         }
@@ -263,7 +261,7 @@ impl TileLists {
             .par_chunks(chunk_len)
             .map(|splats| {
                 if pairs.load(Ordering::Relaxed) > limit {
-                    return ReachedTiles { counts: Vec::new(), reached: Vec::new(), tiles: Vec::new() };
+                    return ReachedTiles::default();
                 }
                 let chunk = ReachedTiles::new(splats, &region);
                 pairs.fetch_add(chunk.reached.len() as u64, Ordering::Relaxed);
@@ -286,8 +284,8 @@ impl TileLists {
         for tile in 0..tiles {
             self.tile_offsets.push(first);
             for chunk in &mut chunks {
-                let count = std::mem::replace(&mut chunk.tiles[tile], first);
-                first += count;
+                chunk.firsts.push(first);
+                first += chunk.tiles[tile];
             }
         }
         self.tile_offsets.push(first);

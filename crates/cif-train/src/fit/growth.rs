@@ -13,7 +13,7 @@ use crate::step::InstancePass;
 use crate::times::StepTimes;
 use crate::trainer::Trainer;
 
-/// Steps before measuring, on the processor and on a GPU, which has a queue of steps to fill first.
+/// Steps before measuring, on the processor and on a GPU, where eight of them are recorded ahead before any is waited for.
 const WARM_UP: (usize, usize) = (2, 20);
 
 /// Fewest steps that are measured, and the most.

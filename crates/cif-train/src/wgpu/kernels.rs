@@ -267,7 +267,7 @@ fn column(parameter: &Parameter) -> Constant {
     Constant::Unsigned(geometry_column(parameter).expect("a parameter of the geometry") as u32)
 }
 
-/// Rows of a plane that a thread of the optimiser goes down.
+/// Rows of a plane that a thread of the optimiser goes down; it reads four more for the differences at the ends.
 pub(super) const BAND: usize = 8;
 
 const CONSTANTS: Snippet = Snippet {
