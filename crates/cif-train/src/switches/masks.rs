@@ -1,6 +1,7 @@
 //! Masks of a frame as they are compared, and the frames of a camera in order.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 use cif_geometry::PixelGrid;
 use cif_render::UNLABELLED;
@@ -90,6 +91,19 @@ impl Sequence {
     /// True where a frame follows that before it closely.
     pub(super) fn follows(&self, at: usize) -> bool {
         at > 0 && self.times[at] - self.times[at - 1] <= NEAR
+    }
+
+    /// The frames around one that follow each other closely and are `shown`; `None` where no frame close to them is known
+    /// not to be.
+    pub(super) fn moment(&self, at: usize, shown: impl Fn(usize) -> bool) -> Option<Range<usize>> {
+        let (mut from, mut to) = (at, at + 1);
+        while self.follows(from) && shown(from - 1) {
+            from -= 1;
+        }
+        while to < self.len() && self.follows(to) && shown(to) {
+            to += 1;
+        }
+        (self.follows(from) || (to < self.len() && self.follows(to))).then_some(from..to)
     }
 
     /// The frames closely before and after one.

@@ -157,3 +157,27 @@ fn masks_without_the_place_and_the_colors_of_their_object_are_taken_away() {
     };
     assert_eq!(taken(&(0..20).map(jumps).collect::<Vec<_>>()), [7]);
 }
+
+#[test]
+fn sightings_of_a_moment_with_foreign_colors_are_taken_away() {
+    // A red thing that comes in late and moves by more than its width; masks before that are a third on something red.
+    let seen = |moment: &[usize], red: u32| {
+        let frame = |k: usize| {
+            let left = (5 * k as u32) % 45;
+            let things = if k < 8 { [48, 12, red, 6] } else { [left, 2, 4, 8] };
+            let masks: &[(u16, Rectangle)] = match k {
+                0..8 if moment.contains(&k) => &[(1, [48, 12, 6, 6])],
+                0..8 => &[],
+                _ => &[(1, [left, 2, 4, 8])],
+            };
+            frame(k, &[(RED, things)], masks)
+        };
+        let found = switches(&(0..32).map(frame).collect::<Vec<_>>());
+        (0..found.len()).filter(|k| !found[*k].is_empty()).collect::<Vec<_>>()
+    };
+    assert_eq!(seen(&[3], 2), [3]);
+    assert_eq!(seen(&[0, 5, 6], 2), [0, 5, 6]);
+    // What has its colours may be it, and so may what is seen for longer, as in a shadow.
+    assert!(seen(&[3], 6).is_empty());
+    assert!(seen(&[2, 3, 4, 5], 2).is_empty());
+}
