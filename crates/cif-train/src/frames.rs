@@ -20,7 +20,7 @@ use crate::mask_edges::{self, Doubt};
 use crate::mask_table::MaskTable;
 use crate::phase::Phase;
 use crate::phases::Phases;
-use crate::switches::{Seen, put_right, switches};
+use crate::switches::{Correction, Seen, corrections};
 use crate::tracks::misfits;
 
 /// A decoded frame.
@@ -63,8 +63,8 @@ struct Decoding {
     background: [f32; 3],
     /// Files of feature maps, by index in the capture.
     maps: BTreeMap<usize, PathBuf>,
-    /// New labels of masks that show other objects, by index in the capture.
-    switched: BTreeMap<usize, BTreeMap<u16, u16>>,
+    /// Changes to masks that show something else, by index in the capture.
+    corrections: BTreeMap<usize, Correction>,
     /// True where outlines of masks are moved to where colours change.
     moves_edges: bool,
 }
@@ -94,8 +94,8 @@ impl FrameStore {
         }
         let training = dataset.frames.iter().enumerate().filter(|(_, f)| f.split == Split::Train);
         let frames = training.map(|(index, _)| (index, None)).collect();
-        let switched = BTreeMap::new();
-        let decoding = Arc::new(Decoding { label_of_id, background, maps, switched, moves_edges: false });
+        let corrections = BTreeMap::new();
+        let decoding = Arc::new(Decoding { label_of_id, background, maps, corrections, moves_edges: false });
         let mut store = Self { frames, decoding, ahead: None, masks: Mutex::default() };
         if store.frames.is_empty() {
             return Err(TrainError::NoTrainingFrames { root: dataset.root.clone() });
@@ -137,7 +137,7 @@ impl FrameStore {
             label_of_id: vec![UNLABELLED; usize::from(u16::MAX) + 1],
             background,
             maps: BTreeMap::new(),
-            switched: BTreeMap::new(),
+            corrections: BTreeMap::new(),
             moves_edges: false,
         };
         Self {
@@ -261,24 +261,20 @@ impl FrameStore {
         left_out
     }
 
-    /// Puts right the masks that show other objects by what was `read` of them (see [`crate::switches`]); the new
-    /// labels of masks by old ones, by index in the capture.
-    pub(crate) fn put_switches_right(
-        &mut self,
-        read: Vec<ReadMasks>,
-    ) -> &BTreeMap<usize, BTreeMap<u16, u16>> {
+    /// Puts right the masks that show something else by what was `read` of them (see [`crate::switches`]); the changes
+    /// by index in the capture.
+    pub(crate) fn put_masks_right(&mut self, read: Vec<ReadMasks>) -> &BTreeMap<usize, Correction> {
         let seen: Vec<Seen> = read.into_iter().map(|masks| masks.seen).collect();
-        let found =
-            switches(&seen).into_iter().zip(&mut self.frames).filter(|(renamed, _)| !renamed.is_empty());
-        for (renamed, (index, frame)) in found {
+        let found = corrections(&seen).into_iter().zip(&mut self.frames);
+        for (correction, (index, frame)) in found.filter(|(correction, _)| !correction.is_none()) {
             if let Some(frame) = frame {
-                let labels = frame.labels.as_ref().map(|labels| put_right(labels, &renamed));
+                let labels = frame.labels.as_ref().map(|labels| correction.applied(labels));
                 *frame = Arc::new(TrainFrame::new(frame.image.clone(), labels, frame.features.clone()));
             }
-            Arc::make_mut(&mut self.decoding).switched.insert(*index, renamed);
+            Arc::make_mut(&mut self.decoding).corrections.insert(*index, correction);
         }
         self.forget_masks();
-        &self.decoding.switched
+        &self.decoding.corrections
     }
 
     /// Moves the outlines of masks to where colours change if they are rough (see [`crate::mask_edges`]); true where
@@ -315,8 +311,8 @@ impl FrameStore {
         let rename = |label: &u16| if *label == UNLABELLED { UNLABELLED } else { new_label(label - 1) + 1 };
         let decoding = Arc::make_mut(&mut self.decoding);
         decoding.label_of_id.iter_mut().for_each(|label| *label = rename(label));
-        for renamed in decoding.switched.values_mut() {
-            *renamed = renamed.iter().map(|(from, to)| (rename(from), rename(to))).collect();
+        for correction in decoding.corrections.values_mut() {
+            *correction = correction.relabelled(|label| rename(&label));
         }
         self.forget_masks();
         for frame in self.frames.iter_mut().filter_map(|(_, frame)| frame.as_mut()) {
@@ -339,8 +335,8 @@ impl Decoding {
     fn load(&self, dataset: &Dataset, index: usize) -> Result<TrainFrame, cif_dataset::Error> {
         let data = dataset.load_frame(index, self.background)?;
         let mut labels = data.mask.map(|mask| mask.map(|id| self.label_of_id[usize::from(*id)]));
-        if let Some(renamed) = self.switched.get(&index) {
-            labels = labels.map(|labels| put_right(&labels, renamed));
+        if let Some(correction) = self.corrections.get(&index) {
+            labels = labels.map(|labels| correction.applied(&labels));
         }
         if self.moves_edges && data.confidence.is_none() {
             labels = labels.map(|labels| mask_edges::moved(&data.image, &labels));

@@ -224,8 +224,9 @@ pub struct MotionConfig {
     /// usual from where the other frames see them have a wrong camera or wrong masks: they are named and left out.
     /// Default 20; 0 keeps every frame, as in `paper`.
     pub misfit: f32,
-    /// True where masks that show another object, by their colours and by their places in the frames before and after,
-    /// are put right: exchanged where two show each other, else taken away. Default true; false in `paper`.
+    /// True where masks that show something else than their object, by their colours and by their places in the frames
+    /// before and after, are put right: exchanged where two show each other, else taken away, and so are blobs apart from
+    /// them. Default true; false in `paper`.
     pub switches: bool,
     /// True where outlines of masks are moved to where the colours change, if many of them are clearly beside it, as
     /// those of trackers are. Default true; false in `paper`.

@@ -13,7 +13,7 @@ use crate::mask_table::MaskTable;
 use crate::phase::Phase;
 use crate::phases::Phases;
 use crate::sightings::Sightings;
-use crate::switches::{Seen, put_right, switches};
+use crate::switches::{Seen, corrections};
 use crate::tracks::{Observation, misfits, travels};
 use crate::working_size;
 
@@ -188,7 +188,7 @@ fn observations<'a>(
         seen.push(of);
     }
     // As training puts them right.
-    let seen = masks.iter().zip(switches(&seen)).map(|(mask, renamed)| put_right(mask, &renamed));
+    let seen = masks.iter().zip(corrections(&seen)).map(|(mask, correction)| correction.applied(mask));
     let mut seen: Vec<BTreeMap<u16, Observation>> = seen
         .zip(&frames)
         .map(|(mask, frame)| MaskTable::of(&mask).observations(&frame.camera, frame.time_index))

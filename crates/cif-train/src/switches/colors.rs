@@ -21,12 +21,13 @@ impl Colors {
         Self(sum)
     }
 
-    pub(super) fn mean<'a>(all: impl Iterator<Item = &'a Self>) -> Self {
+    /// Mean of some, by their weights.
+    pub(super) fn mean<'a>(all: impl Iterator<Item = (&'a Self, f64)>) -> Self {
         let mut sum = vec![0.0; COLORS];
         let mut count = 0.0_f64;
-        for Self(colors) in all {
-            count += 1.0;
-            sum.iter_mut().zip(colors).for_each(|(sum, value)| *sum += value);
+        for (Self(colors), weight) in all {
+            count += weight;
+            sum.iter_mut().zip(colors).for_each(|(sum, value)| *sum += weight * value);
         }
         sum.iter_mut().for_each(|value| *value /= count.max(1.0));
         Self(sum)

@@ -80,6 +80,6 @@ fn shorter(cuts: &[usize], length: usize) -> Vec<usize> {
 fn gain(now: &Now<'_>, [a, b]: [u16; 2], typical: &BTreeMap<u16, TypicalColors>) -> Option<f64> {
     let masks = [now.get(&a)?, now.get(&b)?];
     let objects = [typical.get(&a)?, typical.get(&b)?];
-    let exchanged = objects[0].likeness(masks[1]) + objects[1].likeness(masks[0]);
-    Some(exchanged - objects[0].likeness(masks[0]) - objects[1].likeness(masks[1]))
+    let exchanged = objects[0].likeness(&masks[1].colors) + objects[1].likeness(&masks[0].colors);
+    Some(exchanged - objects[0].likeness(&masks[0].colors) - objects[1].likeness(&masks[1].colors))
 }

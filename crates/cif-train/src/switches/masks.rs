@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 
 use cif_geometry::PixelGrid;
-use cif_render::UNLABELLED;
 
 use super::colors::Colors;
-use super::place::{Place, places};
+use super::pieces::{Piece, pieces};
+use super::place::Place;
 
 /// Pixels below which a mask is too small to be looked at.
 const FEWEST: usize = 8;
@@ -23,6 +23,30 @@ pub(super) struct Mask {
     pub pixels: usize,
     pub colors: Colors,
     pub place: Place,
+    /// What it consists of, the largest first.
+    pub pieces: Vec<Piece>,
+}
+
+impl Mask {
+    fn of(label: u16, pieces: Vec<Piece>) -> Self {
+        let parts = || pieces.iter().map(|piece| (&piece.colors, piece.pixels as f64));
+        let place = pieces.iter().fold(Place::default(), |place, piece| place.with(&piece.place));
+        let pixels = pieces.iter().map(|piece| piece.pixels).sum();
+        Self { label, pixels, colors: Colors::mean(parts()), place, pieces }
+    }
+
+    /// The mask without some of its pieces, and the first pixels of the parts of these.
+    pub(super) fn split(&self, without: &[bool]) -> (Self, Vec<u32>) {
+        let (mut kept, mut left_out) = (Vec::new(), Vec::new());
+        for (piece, without) in self.pieces.iter().zip(without) {
+            if *without {
+                left_out.extend(&piece.firsts);
+            } else {
+                kept.push(piece.clone());
+            }
+        }
+        (Self::of(self.label, kept), left_out)
+    }
 }
 
 /// Masks of a frame by the label that each of them has now.
@@ -45,21 +69,8 @@ impl Seen {
     ) -> Self {
         let mut seen = Self { camera: camera.to_owned(), time, masks: Vec::new() };
         let Some(labels) = labels else { return seen };
-        let mut pixels: BTreeMap<u16, Vec<[u8; 3]>> = BTreeMap::new();
-        for (label, color) in labels.pixels.iter().zip(&image.pixels) {
-            if *label != UNLABELLED {
-                pixels.entry(*label).or_default().push(*color);
-            }
-        }
-        let mut places = places(labels);
-        for (label, colors) in pixels.into_iter().filter(|(_, colors)| colors.len() >= FEWEST) {
-            seen.masks.push(Mask {
-                label,
-                pixels: colors.len(),
-                colors: Colors::of(colors.into_iter()),
-                place: places.remove(&label).unwrap_or_default(),
-            });
-        }
+        let masks = pieces(image, labels).into_iter().map(|(label, pieces)| Mask::of(label, pieces));
+        seen.masks.extend(masks.filter(|mask| mask.pixels >= FEWEST));
         seen
     }
 }

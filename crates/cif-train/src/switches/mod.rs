@@ -4,11 +4,13 @@
 //! Every object has a typical distribution of colours, that of most of its masks, and hardly moves from one frame of a
 //! camera to the next. Two masks that change places and soon change back are exchanged (see [`exchanges`]), and so are
 //! two that have each the colours of the other. A mask that has the colours of another object alone, or neither the
-//! colours of its own nor its place (see [`strays`]), is taken away, for nobody knows where the object is.
+//! colours of its own nor its place (see [`strays`]), is taken away, for nobody knows where the object is. Before that,
+//! masks lose what lies apart and has foreign colours (see [`pieces`]).
 
 mod colors;
 mod exchanges;
 mod masks;
+mod pieces;
 mod place;
 mod strays;
 mod usual;
@@ -26,12 +28,46 @@ use usual::{FEWEST_PIXELS, MOST, UNUSUAL, typical_colors};
 const LIKE: f64 = 0.93;
 const MORE: f64 = 0.12;
 
-/// New labels of the masks of every frame that show another object, by their old ones; [`UNLABELLED`] for those that
-/// are taken away.
-pub(crate) fn switches(frames: &[Seen]) -> Vec<BTreeMap<u16, u16>> {
+/// Changes to the masks of a frame.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Correction {
+    /// New labels of masks that show another object, by their old ones; [`UNLABELLED`] for those that are taken away.
+    pub renamed: BTreeMap<u16, u16>,
+    /// Foreign parts of masks by label: the index of the first pixel of each, in the order of rows.
+    pub foreign: BTreeMap<u16, Vec<u32>>,
+}
+
+impl Correction {
+    /// True where all masks stay as they are.
+    pub(crate) fn is_none(&self) -> bool {
+        self.renamed.is_empty() && self.foreign.is_empty()
+    }
+
+    /// A mask image put right: foreign parts have the label that surrounds them most.
+    pub(crate) fn applied(&self, labels: &PixelGrid<u16>) -> PixelGrid<u16> {
+        let mut labels = labels.clone();
+        self.foreign.values().for_each(|parts| pieces::take_away(&mut labels, parts));
+        labels.map(|label| self.renamed.get(label).copied().unwrap_or(*label))
+    }
+
+    /// The same with other labels.
+    pub(crate) fn relabelled(&self, label: impl Fn(u16) -> u16) -> Self {
+        Self {
+            renamed: self.renamed.iter().map(|(from, to)| (label(*from), label(*to))).collect(),
+            foreign: self.foreign.iter().map(|(of, parts)| (label(*of), parts.clone())).collect(),
+        }
+    }
+}
+
+/// Finds what is wrong with the masks of every frame.
+pub(crate) fn corrections(frames: &[Seen]) -> Vec<Correction> {
     let sequences = Sequence::all(frames);
     let mut now: Vec<Now<'_>> =
         frames.iter().map(|frame| frame.masks.iter().map(|mask| (mask.label, mask)).collect()).collect();
+    let without = pieces::without_foreign(&sequences, &now);
+    for ((frame, label), (mask, _)) in &without {
+        now[*frame].insert(*label, mask);
+    }
     exchanges::put_back(&sequences, &mut now);
     follow_colors(&mut now);
     strays::take_away(&sequences, &mut now);
@@ -40,9 +76,13 @@ pub(crate) fn switches(frames: &[Seen]) -> Vec<BTreeMap<u16, u16>> {
             frame.masks.iter().map(|mask| (mask.label, UNLABELLED)).collect();
         renamed.extend(now.iter().map(|(label, mask)| (mask.label, *label)));
         renamed.retain(|old, new| old != new);
-        renamed
+        Correction { renamed, foreign: BTreeMap::new() }
     };
-    frames.iter().zip(&now).map(renamed).collect()
+    let mut found: Vec<Correction> = frames.iter().zip(&now).map(renamed).collect();
+    for ((frame, label), (_, parts)) in without {
+        found[frame].foreign.insert(label, parts);
+    }
+    found
 }
 
 /// Exchanges masks with the colours of each other, and takes away those with the colours of another object alone.
@@ -50,13 +90,13 @@ fn follow_colors(frames: &mut [Now<'_>]) {
     let typical = typical_colors(frames);
     let shown = |label: &u16, mask: &Mask| {
         let object = typical.get(label).filter(|_| mask.pixels >= FEWEST_PIXELS)?;
-        if object.unlike(mask) <= UNUSUAL {
+        if object.unlike(&mask.colors) <= UNUSUAL {
             return None;
         }
         let others = typical.iter().filter(|(other, _)| *other != label);
-        let best = others.map(|(other, object)| (*other, object.likeness(mask)));
+        let best = others.map(|(other, object)| (*other, object.likeness(&mask.colors)));
         let (other, like) = best.max_by(|a, b| a.1.total_cmp(&b.1))?;
-        (like >= LIKE && like >= object.likeness(mask) + MORE).then_some(other)
+        (like >= LIKE && like >= object.likeness(&mask.colors) + MORE).then_some(other)
     };
     let (mut counts, mut all): (BTreeMap<u16, usize>, BTreeMap<u16, usize>) = Default::default();
     let mut found: Vec<BTreeMap<u16, u16>> = Vec::with_capacity(frames.len());
@@ -81,11 +121,6 @@ fn follow_colors(frames: &mut [Now<'_>]) {
             }
         }
     }
-}
-
-/// A mask image with new labels.
-pub(crate) fn put_right(labels: &PixelGrid<u16>, renamed: &BTreeMap<u16, u16>) -> PixelGrid<u16> {
-    labels.map(|label| renamed.get(label).copied().unwrap_or(*label))
 }
 
 #[cfg(test)]

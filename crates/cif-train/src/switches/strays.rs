@@ -61,7 +61,7 @@ pub(super) fn take_away(sequences: &[Sequence], frames: &mut [Now<'_>]) {
 
 /// True where a mask is not that of its object, given the masks before and after, where there are any.
 fn strays(mask: &Mask, typical: &TypicalColors, steady: f64, near: &[&Mask]) -> bool {
-    let unlike = typical.unlike(mask);
+    let unlike = typical.unlike(&mask.colors);
     let overlap = |other: &Mask| mask.place.overlap(&other.place);
     if steady < STEADY {
         return unlike > FOREIGN_ANYWHERE && mask.pixels >= FEWEST_PIXELS;
@@ -86,7 +86,7 @@ fn momentary(
 ) -> bool {
     let mask = |at: usize| frames[sequence.frames[at]].get(&label);
     let Some(moment) = sequence.moment(at, |at| mask(at).is_some()) else { return false };
-    moment.len() <= MOMENT && moment.filter_map(mask).all(|mask| typical.unlike(mask) > FOREIGN)
+    moment.len() <= MOMENT && moment.filter_map(mask).all(|mask| typical.unlike(&mask.colors) > FOREIGN)
 }
 
 /// Overlap of the masks of every object from frame to frame, in the middle, by label.

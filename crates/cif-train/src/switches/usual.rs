@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::colors::Colors;
-use super::masks::{Mask, Now};
+use super::masks::Now;
 
 /// Pixels and masks below which the colours of an object are not known.
 pub(super) const FEWEST_PIXELS: usize = 30;
@@ -24,7 +24,7 @@ pub(super) struct TypicalColors {
 
 impl TypicalColors {
     fn of(masks: &[&Colors]) -> Self {
-        let mut colors = Colors::mean(masks.iter().copied());
+        let mut colors = Colors::mean(masks.iter().map(|mask| (*mask, 1.0)));
         let mut middle = 1.0;
         for _ in 0..ROUNDS {
             let like: Vec<f64> = masks.iter().map(|mask| mask.likeness(&colors)).collect();
@@ -32,19 +32,19 @@ impl TypicalColors {
             sorted.sort_by(f64::total_cmp);
             middle = sorted[sorted.len() / 2];
             let kept = masks.iter().zip(&like).filter(|(_, like)| **like >= middle - UNUSUAL);
-            colors = Colors::mean(kept.map(|(mask, _)| *mask));
+            colors = Colors::mean(kept.map(|(mask, _)| (*mask, 1.0)));
         }
         Self { colors, middle }
     }
 
-    /// Likeness of a mask.
-    pub(super) fn likeness(&self, mask: &Mask) -> f64 {
-        mask.colors.likeness(&self.colors)
+    /// Likeness of the colours of a mask, or of a piece of one.
+    pub(super) fn likeness(&self, colors: &Colors) -> f64 {
+        colors.likeness(&self.colors)
     }
 
-    /// By how much a mask is less like the object than most of its masks are.
-    pub(super) fn unlike(&self, mask: &Mask) -> f64 {
-        self.middle - self.likeness(mask)
+    /// By how much these are less like the object than most of its masks are.
+    pub(super) fn unlike(&self, colors: &Colors) -> f64 {
+        self.middle - self.likeness(colors)
     }
 }
 

@@ -36,6 +36,7 @@ use crate::stage::Stage;
 use crate::start::Start;
 use crate::state::State;
 use crate::step::{InstancePass, StepLoss};
+use crate::switches::Correction;
 use crate::times::StepTimes;
 use crate::working_size::{self, Whole};
 
@@ -57,23 +58,28 @@ fn misfit_warning(dataset: &Dataset, left_out: &[usize]) -> Option<TrainEvent> {
     })
 }
 
-/// Note that counts the masks that were given other labels; `None` where none was.
-fn switch_note(dataset: &Dataset, switched: &BTreeMap<usize, BTreeMap<u16, u16>>) -> Option<TrainEvent> {
+/// Note that counts the masks that were changed; `None` where none was.
+fn correction_note(dataset: &Dataset, corrections: &BTreeMap<usize, Correction>) -> Option<TrainEvent> {
     let name = |label: u16| dataset.instances[usize::from(label) - 1].label.as_str();
-    let (mut exchanged, mut alone): (BTreeMap<[u16; 2], usize>, BTreeMap<u16, usize>) = Default::default();
-    for (from, to) in switched.values().flatten() {
-        if *to == UNLABELLED {
-            *alone.entry(*from).or_default() += 1;
-        } else if from < to {
-            *exchanged.entry([*from, *to]).or_default() += 1;
+    let mut exchanged: BTreeMap<[u16; 2], usize> = BTreeMap::new();
+    let (mut alone, mut blobs): (BTreeMap<u16, usize>, BTreeMap<u16, usize>) = Default::default();
+    for correction in corrections.values() {
+        for (from, to) in &correction.renamed {
+            if *to == UNLABELLED {
+                *alone.entry(*from).or_default() += 1;
+            } else if from < to {
+                *exchanged.entry([*from, *to]).or_default() += 1;
+            }
         }
+        correction.foreign.keys().for_each(|label| *blobs.entry(*label).or_default() += 1);
     }
     let pairs = exchanged.iter().map(|([a, b], n)| format!("{} and {} exchanged in {n}", name(*a), name(*b)));
     let singles = alone.iter().map(|(label, n)| format!("{} left out in {n}", name(*label)));
-    let found: Vec<String> = pairs.chain(singles).collect();
+    let apart = blobs.iter().map(|(label, n)| format!("blobs apart from {} left out in {n}", name(*label)));
+    let found: Vec<String> = pairs.chain(singles).chain(apart).collect();
     (!found.is_empty()).then(|| {
         TrainEvent::note(format!(
-            "masks show other objects by their colours and places, frames: {} (motion.switches = false keeps such \
+            "masks show something else by their colours and places, frames: {} (motion.switches = false keeps such \
              masks)",
             found.join(", ")
         ))
@@ -108,7 +114,7 @@ fn put_masks_right(
         messages.extend(misfit_warning(dataset, &left_out));
     }
     if motion.switches {
-        messages.extend(switch_note(dataset, frames.put_switches_right(read)));
+        messages.extend(correction_note(dataset, frames.put_masks_right(read)));
     }
     if motion.edges && frames.put_edges_right(dataset, phases)? {
         messages.push(TrainEvent::note(
