@@ -1,9 +1,12 @@
-//! Mending of poses that jump: following a few times may end on a wrong side of what they show, from which following
-//! the times behind them comes back.
+//! Mending of poses: of those that jump, as following a few times may end on a wrong side of what they show, from which
+//! following the times behind them comes back; and of those aside of their masks, as a path that bends little passes by
+//! where something bounces, and nothing draws an object onto a mask that it does not touch.
+
+use glam::DVec3;
 
 use super::fit::{Fit, TimedPose, log, onward};
 use super::shape::{Pose, Shape};
-use super::view::median;
+use super::view::{ObjectView, WITHIN, median, meeting_point};
 use crate::error::TrainError;
 use crate::phases::Phases;
 
@@ -42,6 +45,50 @@ pub(super) fn mend(fit: &mut Fit<'_>, phases: &Phases) -> Result<(), TrainError>
         march(fit, &times[after..], &earlier);
     }
     Ok(())
+}
+
+/// Moves poses onto masks from which they lie aside, farther than these reach, where that explains more of what is seen.
+///
+/// # Errors
+/// [`TrainError::Stopped`] when the run is to stop.
+pub(super) fn onto_masks(fit: &mut Fit<'_>, phases: &Phases) -> Result<(), TrainError> {
+    let times: Vec<usize> = fit.poses.keys().copied().filter(|time| fit.run(*time).is_empty()).collect();
+    for time in times {
+        phases.check()?;
+        let pose = fit.poses[&time];
+        let Some(place) = masked_place(fit, time, pose.translation) else { continue };
+        // As far away as now, and as its outline tells.
+        let places = [Some(place), fit.outline.path.get(&time).copied()].into_iter().flatten();
+        let guesses: Vec<Pose> = places.map(|translation| Pose { translation, ..pose }).collect();
+        if let Some(Compared { present, found, pose }) = compared(fit, time, &guesses)
+            && found < GAIN * present
+        {
+            fit.poses.insert(time, pose);
+            fit.moments.remove(&time);
+        }
+    }
+    Ok(())
+}
+
+/// Where the masks of a time are, as far away as a place aside of all of them; `None` where it is on one, or none shows it.
+fn masked_place(fit: &Fit<'_>, time: usize, place: DVec3) -> Option<DVec3> {
+    let of_time = fit.views.iter().filter(|view| view.time_index == time && view.is_reliable());
+    let mut views: Vec<&ObjectView> = Vec::new();
+    for view in of_time {
+        let (pixel, _) = view.camera.project(place)?;
+        if (pixel - view.centroid).length() <= view.reach(WITHIN) {
+            return None;
+        }
+        views.push(view);
+    }
+    match views[..] {
+        [] => None,
+        [view] => {
+            let (_, depth) = view.camera.project(place)?;
+            Some(view.camera.centre() + depth * view.camera.ray(view.centroid))
+        }
+        _ => meeting_point(views.into_iter().map(|view| (view, view.visible.powi(2)))),
+    }
 }
 
 /// Places of times before which poses jump.

@@ -14,7 +14,7 @@ use super::bend;
 use super::fit::{Fit, Turns};
 use super::follow::follow;
 use super::grow::grow;
-use super::mend::mend;
+use super::mend::{mend, onto_masks};
 use super::object::{FOLLOWED, Object, Started};
 use super::path::smooth;
 use super::plane::Plane;
@@ -102,6 +102,7 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
     };
     let (outline, phases) = (object.outline, object.surroundings.phases);
     grow(&mut fit, &path);
+    onto_masks(&mut fit, phases)?;
     if way == Way::Followed {
         mend(&mut fit, phases)?;
     }

@@ -9,8 +9,9 @@ use glam::{DQuat, DVec3};
 use rand::RngExt;
 
 use super::bend;
+use super::fit::Fit;
 use super::grow::grow;
-use super::mend::mend;
+use super::mend::{mend, onto_masks};
 use super::object::Object;
 use super::outlines;
 use super::plane::{self, Plane};
@@ -465,6 +466,31 @@ fn poses_that_jump_are_mended_from_both_sides() {
     let turns = poses.iter().map(|(time, pose)| pose.rotation.angle_between(truth[*time].0).to_degrees());
     let turns: Vec<f64> = turns.collect();
     assert!(turns.iter().all(|turn| *turn < 8.0), "{turns:.0?}");
+}
+
+#[test]
+fn poses_aside_of_their_masks_move_onto_them() {
+    let place = |k: usize| DVec3::new(0.006 * k as f64 - 0.09, 0.0, 0.05);
+    let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(|k| (DQuat::IDENTITY, place(k))).collect();
+    for cameras in [moving as Cameras, rig] {
+        let views = views(solid(&box_places(), patches, 0.006), &truth, cameras);
+        let errors = with_objects(Some(&FLOOR), &views, |objects| {
+            let pose = |time: usize| Pose { rotation: truth[time].0, translation: truth[time].1 };
+            let poses: BTreeMap<usize, Pose> = (0..TIMES).map(|time| (time, pose(time))).collect();
+            let shape = objects[0].hull(&poses, 300, &mut objects[0].rng()).unwrap();
+            let mut fit = objects[0].fit(poses, shape, objects[0].rng());
+            let all: Vec<usize> = (0..views.len()).collect();
+            fit.steps(&all, 600, |_| (1.0, 0.0, 0));
+            // As a smooth path passes by where something bounces.
+            fit.poses.get_mut(&9).unwrap().translation += DVec3::new(0.0, 0.0, 0.2);
+            let error = |fit: &Fit<'_>| (fit.poses[&9].translation - truth[9].1).length();
+            let before = fit.poses.clone();
+            onto_masks(&mut fit, &Phases::default()).unwrap();
+            let kept = (0..TIMES).filter(|time| *time != 9 && fit.poses[time] == before[time]).count();
+            (error(&fit), kept)
+        });
+        assert!(errors.0 < 0.012 && errors.1 == TIMES - 1, "{errors:?}");
+    }
 }
 
 #[test]
