@@ -18,8 +18,7 @@
 //! | `sequence` | which values over time cost least |
 //! | `follow` | how it moves from time to time |
 //! | `grow` | where it is when little of it is seen |
-//! | `mend` | which of its poses jump, or lie aside of its masks, and where they belong |
-//! | `windows` | when it rests |
+//! | `mend` | which of its poses jump, and where they belong |
 //! | `trials` | which way is kept |
 //! | `bend` | whether it rather deforms |
 //! | `start` | everything in order |
@@ -60,7 +59,6 @@ mod texture;
 mod trials;
 mod view;
 mod ways;
-mod windows;
 
 use cif_dataset::{Dataset, Split};
 use glam::DVec3;

@@ -24,7 +24,6 @@ use super::split::{SplitViews, times_of};
 use super::trials::{self, GAUSSIANS, STEPS};
 use super::view::{ObjectView, median};
 use super::ways::{Way, rolled};
-use super::windows::tie;
 use crate::error::TrainError;
 
 /// Reliable times below which ways of moving cannot be distinguished.
@@ -107,7 +106,6 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
     if way == Way::Followed {
         mend(&mut fit, phases)?;
     }
-    tie(&mut fit, phases)?;
     phases.check()?;
     let all: Vec<usize> = object.views_at(&fit.poses).collect();
     let levels = fit.levels();

@@ -23,7 +23,6 @@ use super::testing::{
     views_in_masks, views_of_groups, with_objects,
 };
 use super::view::ObjectView;
-use super::windows::tie;
 use crate::phases::Phases;
 use crate::random::{Purpose, stream};
 
@@ -492,48 +491,6 @@ fn poses_aside_of_their_masks_move_onto_them() {
         });
         assert!(errors.0 < 0.012 && errors.1 == TIMES - 1, "{errors:?}");
     }
-}
-
-/// Windows of rest of a box that is put elsewhere between two rests, or moves on, and the largest error of its places in
-/// them, metres; its distances from the camera that moves were wrong by up to a twelfth before.
-fn tied(moves_on: bool) -> (Vec<Vec<usize>>, f64) {
-    let place = |k: usize| {
-        let moved =
-            if moves_on { k as f64 / TIMES as f64 } else { ((k as f64 - 11.0) / 6.0).clamp(0.0, 1.0) };
-        DVec3::new(0.2 * moved - 0.1, 0.0, 0.05)
-    };
-    let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(|k| (DQuat::IDENTITY, place(k))).collect();
-    let views = views(solid(&box_places(), patches, 0.006), &truth, moving);
-    let (poses, runs) = with_objects(Some(&FLOOR), &views, |objects| {
-        let pose = |time: usize| Pose { rotation: truth[time].0, translation: truth[time].1 };
-        let poses: BTreeMap<usize, Pose> = (0..TIMES).map(|time| (time, pose(time))).collect();
-        let shape = objects[0].hull(&poses, 300, &mut objects[0].rng()).unwrap();
-        let mut fit = objects[0].fit(poses, shape, objects[0].rng());
-        // Its support says nothing.
-        fit.air = (0..TIMES).collect();
-        let all: Vec<usize> = (0..views.len()).collect();
-        fit.steps(&all, 600, |_| (1.0, 0.0, 0));
-        for (time, pose) in &mut fit.poses {
-            let from = views[*time].camera.centre();
-            pose.translation += (*time as f64).sin() / 12.0 * (pose.translation - from);
-        }
-        fit.steps(&all, 600, |_| (0.0, 0.5, 0));
-        tie(&mut fit, &Phases::default()).unwrap();
-        (fit.poses, fit.runs)
-    });
-    let error = |time: &usize| (poses[time].translation - truth[*time].1).length();
-    let largest = runs.iter().flatten().map(error).fold(0.0, f64::max);
-    (runs, largest)
-}
-
-#[test]
-fn windows_of_rest_tell_how_far_away_an_object_is() {
-    let (runs, error) = tied(false);
-    assert!(runs.len() == 2 && runs.iter().all(|run| run.len() >= 10), "{runs:?}");
-    assert!(error < 0.006, "{error} m");
-    // What moves on has none.
-    let (runs, _) = tied(true);
-    assert!(runs.is_empty(), "{runs:?}");
 }
 
 #[test]
