@@ -5,11 +5,13 @@
 //! camera to the next. Two masks that change places and soon change back are exchanged (see [`exchanges`]), and so are
 //! two that have each the colours of the other. A mask that has the colours of another object alone, or neither the
 //! colours of its own nor its place (see [`strays`]), is taken away, for nobody knows where the object is. Before that,
-//! masks lose what lies apart and has foreign colours (see [`pieces`]).
+//! masks lose what lies apart and has foreign colours (see [`foreign`]).
 
 mod colors;
 mod exchanges;
+mod foreign;
 mod masks;
+mod parts;
 mod pieces;
 mod place;
 mod strays;
@@ -46,7 +48,9 @@ impl Correction {
     /// A mask image put right: foreign parts have the label that surrounds them most.
     pub(crate) fn applied(&self, labels: &PixelGrid<u16>) -> PixelGrid<u16> {
         let mut labels = labels.clone();
-        self.foreign.values().for_each(|parts| pieces::take_away(&mut labels, parts));
+        if !self.foreign.is_empty() {
+            foreign::take_away(&mut labels, &self.foreign.values().flatten().copied().collect());
+        }
         labels.map(|label| self.renamed.get(label).copied().unwrap_or(*label))
     }
 
@@ -64,7 +68,7 @@ pub(crate) fn corrections(frames: &[Seen]) -> Vec<Correction> {
     let sequences = Sequence::all(frames);
     let mut now: Vec<Now<'_>> =
         frames.iter().map(|frame| frame.masks.iter().map(|mask| (mask.label, mask)).collect()).collect();
-    let without = pieces::without_foreign(&sequences, &now);
+    let without = foreign::without(&sequences, &now);
     for ((frame, label), (mask, _)) in &without {
         now[*frame].insert(*label, mask);
     }
