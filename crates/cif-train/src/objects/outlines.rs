@@ -68,8 +68,8 @@ enum Stance {
 }
 
 /// Outlines that the views of an object may have; none where nothing shows where it is. Several cameras at a time give
-/// one. One camera leaves open whether what looks larger comes nearer or shows a broader side, and whether what looks
-/// lower fell over: pictures decide. Where it sees the object from other sides soon after, rays that cross give the path
+/// one. One camera leaves open whether what looks larger comes nearer or shows a broader side, unless it is a ball, and
+/// whether what looks lower fell over: pictures decide. Where it sees the object from other sides soon after, rays that cross give the path
 /// of what leaves the plane. `times` are those of the sequence.
 pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize) -> Vec<Outline> {
     let met = meetings(views);
@@ -81,6 +81,10 @@ pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize
     let leaves = on_plane(Stance::MayLeave).filter(|outline| !outline.air.is_empty());
     let crossing = path::crossing(views, times);
     if crossing.is_empty() {
+        if leaves.is_some() && are_discs(views.iter()) {
+            // A ball has no broader side.
+            found.clear();
+        }
         found.extend(leaves);
     } else {
         let is_resort = !found.is_empty() && leaves.is_none();
@@ -476,6 +480,18 @@ mod tests {
         // Hidden in part, they do not show its size.
         views.iter_mut().filter(|view| view.time_index < 12).for_each(|view| view.visible = 0.6);
         assert!(error(&views) > 0.1, "{} m", error(&views));
+    }
+
+    #[test]
+    fn a_ball_that_looks_larger_comes_nearer() {
+        let up = |time: usize| 0.25 * (1.0 - ((time as f64 - 14.0) / 7.0).powi(2)).max(0.0);
+        let place = |time: usize| DVec3::new(0.004 * time as f64 - 0.05, 0.0, RADIUS + up(time));
+        let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(|time| (DQuat::IDENTITY, place(time))).collect();
+        let thrown = views(solid(&sphere_places(RADIUS), |_| [0.8, 0.5, 0.2], 0.006), &truth, moving);
+        let found = outlines(&thrown, Some(&FLOOR), TIMES);
+        assert!(found.iter().all(|outline| outline.air.len() > 5), "{} outlines", found.len());
+        // One that stays has no other outline.
+        assert!(outlines(&ball(TIMES, moving), Some(&FLOOR), TIMES)[0].air.is_empty());
     }
 
     #[test]
