@@ -23,7 +23,7 @@ pub(super) struct Mask {
     pub pixels: usize,
     pub colors: Colors,
     pub place: Place,
-    /// What it consists of, the largest first.
+    /// Its pieces, the largest first.
     pub pieces: Vec<Piece>,
 }
 
