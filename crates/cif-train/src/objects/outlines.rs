@@ -77,15 +77,14 @@ pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize
         return vec![met_outline(views, plane, met)];
     }
     let on_plane = |stance: Stance| plane.and_then(|plane| on_plane(views, plane, stance));
-    let mut found: Vec<Outline> = on_plane(Stance::Stays).into_iter().collect();
-    let leaves = on_plane(Stance::MayLeave).filter(|outline| !outline.air.is_empty());
-    let crossing = path::crossing(views, times);
     // It has no broader side, and does not fall over, however rough its masks are.
     let is_ball = are_discs(views.iter());
+    let leaves = on_plane(Stance::MayLeave).filter(|outline| !outline.air.is_empty());
+    let crossing = path::crossing(views, times);
+    let must_leave = is_ball && leaves.is_some() && crossing.is_empty();
+    let stays = Some(Stance::Stays).filter(|_| !must_leave).and_then(on_plane);
+    let mut found: Vec<Outline> = stays.into_iter().collect();
     if crossing.is_empty() {
-        if leaves.is_some() && is_ball {
-            found.clear();
-        }
         found.extend(leaves);
     } else {
         let is_resort = !found.is_empty() && leaves.is_none();

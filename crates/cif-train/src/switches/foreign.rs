@@ -57,25 +57,26 @@ fn foreign(pieces: &[Piece], typical: &TypicalColors, near: &[&Place]) -> Vec<bo
     pieces.iter().zip(&unlike).map(is_foreign).collect()
 }
 
-/// Gives parts of masks, by their first pixels, the label that surrounds them most.
-pub(super) fn take_away(labels: &mut PixelGrid<u16>, firsts: &BTreeSet<u32>) {
+/// A mask image in which parts of masks, by their first pixels, have the label that surrounds them most.
+pub(super) fn taken_away(labels: &PixelGrid<u16>, firsts: &BTreeSet<u32>) -> PixelGrid<u16> {
     let (width, height) = (labels.width, labels.height);
-    let before = labels.clone();
-    for (own, parts) in parts(&before) {
+    let mut changed = labels.clone();
+    for (own, parts) in parts(labels) {
         let is_first = |part: &&Part| part.indices(width).next().is_some_and(|first| firsts.contains(&first));
         for part in parts.iter().filter(is_first) {
             let mut around: BTreeMap<u16, usize> = BTreeMap::from([(UNLABELLED, 0)]);
             for index in part.indices(width) {
                 let (x, y) = (index % width, index / width);
                 for (x, y) in [(x.wrapping_sub(1), y), (x + 1, y), (x, y.wrapping_sub(1)), (x, y + 1)] {
-                    if x < width && y < height && *before.at(x, y) != own {
-                        *around.entry(*before.at(x, y)).or_default() += 1;
+                    if x < width && y < height && *labels.at(x, y) != own {
+                        *around.entry(*labels.at(x, y)).or_default() += 1;
                     }
                 }
             }
             let most = around.into_iter().max_by_key(|(_, sides)| *sides);
             let label = most.map_or(UNLABELLED, |(label, _)| label);
-            part.indices(width).for_each(|index| labels.pixels[index as usize] = label);
+            part.indices(width).for_each(|index| changed.pixels[index as usize] = label);
         }
     }
+    changed
 }

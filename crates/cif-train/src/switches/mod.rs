@@ -47,11 +47,9 @@ impl Correction {
 
     /// A mask image put right: foreign parts have the label that surrounds them most.
     pub(crate) fn applied(&self, labels: &PixelGrid<u16>) -> PixelGrid<u16> {
-        let mut labels = labels.clone();
-        if !self.foreign.is_empty() {
-            foreign::take_away(&mut labels, &self.foreign.values().flatten().copied().collect());
-        }
-        labels.map(|label| self.renamed.get(label).copied().unwrap_or(*label))
+        let firsts = self.foreign.values().flatten().copied().collect();
+        let changed = (!self.foreign.is_empty()).then(|| foreign::taken_away(labels, &firsts));
+        changed.as_ref().unwrap_or(labels).map(|label| self.renamed.get(label).copied().unwrap_or(*label))
     }
 
     /// The same with other labels.

@@ -11,9 +11,9 @@ use super::parts::{Part, parts};
 use super::place::Place;
 
 /// Distance from the rest of a mask from which a piece lies apart, of the radius of a disc of its area. At this distance, and
-/// where their colours are foreign, 195 of 234 blobs of twelve captures with masks of trackers are found, and of 229 true pieces that
-/// something in front of the object leaves 3; at half the distance 208 and 6, and 30 of 46 pieces of a person behind grass,
-/// of which this takes none; at twice 171 and 0.
+/// where their colours are foreign, 195 of 234 blobs of twelve captures with masks of trackers are found, and of 229 true
+/// pieces that something in front of the object leaves 3; at half the distance 208 and 6, and 30 of 44 pieces of a person
+/// behind grass, of which this takes none; at twice 171 and 0.
 const APART: f64 = 1.0;
 
 /// Connected pixels below which colours say nothing: they belong to the largest piece.

@@ -7,7 +7,7 @@ use super::masks::{Mask, Now, Sequence};
 use super::usual::{FEWEST_PIXELS, MOST, TypicalColors, UNUSUAL, typical_colors};
 
 /// By how much less than is typical the colours of a mask are those of its object: where nothing is at its place in the
-/// frames before and after, and where these show nothing, because the object or the camera is too fast. In sixteen
+/// frames before and after, and where these show nothing, because the object or the camera is too fast. In twelve
 /// captures all masks of up to [`MOMENT`] frames without the object before and after are within 0.1 where they show their
 /// object, and 0.28 to 0.97 less alike where they do not.
 const FOREIGN: f64 = 0.2;
