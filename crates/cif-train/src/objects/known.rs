@@ -57,6 +57,15 @@ impl KnownObjects {
         self.parts.insert(label, Some(part));
     }
 
+    /// Keeps the part of an object on a joint that was looked for, instead of a motion as a whole that explains no more.
+    pub(crate) fn insert_part(&mut self, label: u16, part: Option<Jointed>) {
+        match (part, self.moving(label)) {
+            (Some(part), Some(whole)) if part.errors[0] <= whole.error => self.insert_turning(label, part),
+            (Some(_), Some(_)) => drop(self.parts.insert(label, None)),
+            (part, _) => drop(self.parts.insert(label, part)),
+        }
+    }
+
     /// Number of objects that move as a whole.
     pub(crate) fn moving_count(&self) -> usize {
         self.rigid.values().filter(|found| matches!(found, Found::Moves(_))).count()
@@ -134,5 +143,54 @@ impl KnownObjects {
             }
         }
         Some(known)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use cif_field::tracks::{JointKind, RotationEvidence};
+    use glam::{DQuat, DVec3};
+
+    use super::super::parts::Hinge;
+    use super::*;
+
+    fn part(error: f64) -> Jointed {
+        let hinge = Hinge { kind: JointKind::Revolute, axis: DVec3::X, point: DVec3::ZERO };
+        let gaussians = || Gaussians::zeros(1);
+        let values = BTreeMap::from([(0, 0.0), (1, 0.5)]);
+        Jointed { base: gaussians(), part: gaussians(), hinge, values, errors: [error, 0.4] }
+    }
+
+    fn whole(error: f64) -> Found {
+        Found::Moves(Box::new(Fitted {
+            poses: BTreeMap::new(),
+            shares: BTreeMap::new(),
+            gaussians: Gaussians::zeros(1),
+            reference: (DQuat::IDENTITY, DVec3::ZERO),
+            rotation: RotationEvidence::Assumed,
+            is_turned: false,
+            error,
+            unturned: None,
+            bent: None,
+            is_ball: false,
+            is_settled: false,
+            way: "slides".into(),
+        }))
+    }
+
+    #[test]
+    fn a_part_is_kept_instead_of_a_motion_as_a_whole_that_explains_no_more() {
+        for (of_part, of_whole, is_kept) in [(0.10, 0.11, true), (0.11, 0.11, true), (0.12, 0.11, false)] {
+            let mut known = KnownObjects::default();
+            known.rigid.insert(1, whole(of_whole));
+            known.insert_part(1, Some(part(of_part)));
+            assert_eq!(known.jointed(1).is_some(), is_kept, "{of_part}, {of_whole}");
+            assert_eq!(known.moving(1).is_none(), is_kept, "{of_part}, {of_whole}");
+            // It was looked for, whatever is kept.
+            assert!(known.parts.contains_key(&1));
+        }
+        let mut known = KnownObjects::default();
+        known.insert_part(1, Some(part(0.2)));
+        assert!(known.jointed(1).is_some());
     }
 }

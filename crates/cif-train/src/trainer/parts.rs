@@ -9,19 +9,22 @@ use super::Trainer;
 use super::objects::in_time;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
-use crate::objects::{self, Jointed, Order, Plane};
+use crate::objects::{self, BENDS_NO_BETTER, Fitted, Jointed, Order, Plane};
 use crate::phase::Phase;
 
 impl Trainer {
-    /// Looks for parts of objects (labels: dense index + 1) that do not travel, nor move as a whole, and of which nothing
-    /// is declared: among all that moves, a joint far away does what travelling does.
+    /// Looks for parts of objects (labels: dense index + 1) that do not travel, and of which nothing is declared: among all
+    /// that moves, a joint far away does what travelling does. Of what was found to move as a whole in place, where bending
+    /// explains more, a part is kept that explains as much, as it has less freedom.
     pub(super) fn find_parts(&mut self, labels: &[u16], plane: Option<&Plane>) -> Result<(), TrainError> {
         let motion = &self.state.config.motion;
         if !motion.rigid || !motion.parts {
             return Ok(());
         }
         let known = &self.state.objects;
-        let is_open = |label: &u16| known.moving(*label).is_none() && self.state.told(*label).is_none();
+        let may_bend = |fitted: &Fitted| fitted.bent.is_some_and(|bent| bent < BENDS_NO_BETTER);
+        let is_open =
+            |label: &u16| known.moving(*label).is_none_or(may_bend) && self.state.told(*label).is_none();
         let candidates: Vec<u16> = labels.iter().copied().filter(is_open).collect();
         let is_known = |label: &&u16| known.parts.contains_key(*label);
         let unknown: Vec<u16> = candidates.iter().filter(|label| !is_known(label)).copied().collect();
@@ -54,7 +57,7 @@ impl Trainer {
         let (mut left_out, mut failed) = (Vec::new(), None);
         for (label, found) in labels.iter().zip(found) {
             match found {
-                Ok(Some(found)) => drop(self.state.objects.parts.insert(*label, found)),
+                Ok(Some(found)) => self.state.objects.insert_part(*label, found),
                 Ok(None) => left_out.push(*label),
                 Err(error) => failed = failed.or(Some(error)),
             }

@@ -31,7 +31,7 @@ use cif_field::tracks::JointKind;
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
-use self::body::Hinge;
+pub(super) use self::body::Hinge;
 pub(crate) use self::fits::Jointed;
 use self::fits::{Budget, FINELY, Fit, keep_kinds};
 use self::guesses::Guess;
@@ -67,9 +67,6 @@ const SIMPLE: f64 = 1.12;
 
 /// Error on pixels left out, of that of the static body, up to which a joint is taken.
 const GAIN: f64 = 0.62;
-
-/// Error on pixels left out beyond which nothing is explained.
-const MOST_ERROR: f64 = 0.1;
 
 /// Loss of the best fit, of that of the static body, from which nothing is looked for: at first, and where values were
 /// searched for again.
@@ -197,7 +194,7 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
     };
     let taken = fine.iter().position(is_simple).unwrap_or(0);
     let Fit { body, loss: error, .. } = fine.swap_remove(taken);
-    if error > MOST_ERROR || error > GAIN * still {
+    if error > GAIN * still {
         return Ok(None);
     }
     Ok(search.finished(body, [error, still]))
