@@ -62,7 +62,10 @@ pub(super) fn follow(
     let Some(first) = at.get(&reference).cloned() else { return Ok(()) };
     let mut order: Vec<usize> =
         at.keys().copied().filter(|t| !fit.poses.contains_key(t) && path.contains_key(t)).collect();
-    order.sort_by_key(|time| time.abs_diff(reference));
+    let starts: Vec<usize> = fit.poses.keys().copied().collect();
+    let start =
+        |time: usize| starts.iter().copied().min_by_key(|start| start.abs_diff(time)).unwrap_or(reference);
+    order.sort_by_key(|time| time.abs_diff(start(*time)));
     if fit.poses.len() > 1 {
         let known: Vec<usize> = fit.poses.keys().flat_map(|time| at[time].iter().copied()).collect();
         // What is at rest does not move at all.
@@ -79,7 +82,7 @@ pub(super) fn follow(
     for time in order {
         phases.check()?;
         let views = &at[&time];
-        let pose = found(fit, time, path, views, reference);
+        let pose = found(fit, time, path, views, start(time));
         fit.poses.insert(time, pose);
         let mut near: Vec<usize> = fit.poses.keys().copied().collect();
         if near.len().is_power_of_two() && near.len() > 2 {

@@ -16,6 +16,7 @@
 //! | `texture`, `ball`, `sphere` | how it turns, where its outline does not show it |
 //! | `ways` | which ways of moving are tried |
 //! | `sequence` | which values over time cost least |
+//! | `rests` | how it is turned between places at which it rests |
 //! | `follow` | how it moves from time to time |
 //! | `grow` | where it is when little of it is seen |
 //! | `mend` | which of its poses jump, and where they belong |
@@ -45,6 +46,7 @@ mod parts;
 mod path;
 mod plane;
 mod priors;
+mod rests;
 mod rotation;
 mod sequence;
 mod shape;

@@ -5,15 +5,19 @@ use std::collections::BTreeMap;
 use cif_field::tracks::RotationEvidence;
 use glam::{DQuat, DVec3};
 use rand_pcg::Pcg64;
+use rayon::prelude::*;
 
 use super::fit::{Fit, Turns};
+use super::follow::follow;
 use super::hull::hull;
 use super::order::Order;
 use super::outline::Outline;
 use super::plane::Plane;
 use super::shape::{Pose, Shape};
+use super::split::times_of;
 use super::view::{ObjectView, is_one_camera, meeting_point};
 use super::ways::Way;
+use crate::error::TrainError;
 use crate::phases::Phases;
 use crate::random::{Purpose, stream};
 
@@ -23,6 +27,9 @@ const TOGETHER: usize = 7;
 
 /// Step from time to time, of the size, up to which an object that leaves its support stands still on it.
 pub(super) const STANDS: f64 = 0.03;
+
+/// Steps of Gaussians that are made anew from where an object was followed to, and rate of poses meanwhile.
+const CARVED: (usize, f64) = (600, 0.3);
 
 /// Gaussians of an object that is followed.
 pub(super) const FOLLOWED: usize = 300;
@@ -158,29 +165,84 @@ impl<'a> Object<'a> {
         times.max_by(|a, b| seen(a).total_cmp(&seen(b)))
     }
 
-    /// Time from which an object is followed to others of its path, among `times`, and the object there: as it stands
-    /// before it is lifted, or after; where it looks from one side to the next as if it did not turn; else as one time
-    /// shows it.
-    pub(super) fn first(&self, path: &BTreeMap<usize, DVec3>, times: &[usize]) -> Option<(usize, Fit<'a>)> {
+    /// The object followed over the times of views, along a path; off its support at times that are given, or at those at
+    /// which its outline may be off. With the time that it is followed from, which shows most of it.
+    ///
+    /// # Errors
+    /// [`TrainError::Stopped`] when the run is to stop.
+    pub(super) fn followed_along(
+        &self,
+        path: &BTreeMap<usize, DVec3>,
+        views: &[usize],
+        off: Option<&[usize]>,
+    ) -> Result<Option<(usize, Fit<'a>)>, TrainError> {
+        let phases = self.surroundings.phases;
+        let Some((reference, starts)) = self.starts(path, &times_of(self.views, views)) else {
+            return Ok(None);
+        };
+        let is_one_of_several = starts.len() > 1;
+        let followed = |mut fit: Fit<'a>| -> Result<(f64, Fit<'a>), TrainError> {
+            if let Some(off) = off {
+                fit.air = off.to_vec();
+            }
+            follow(&mut fit, reference, path, views, phases)?;
+            let loss = if is_one_of_several { self.carved_loss(&fit, views)? } else { 0.0 };
+            Ok((loss, fit))
+        };
+        let followed: Vec<(f64, Fit<'a>)> =
+            starts.into_par_iter().map(followed).collect::<Result<_, TrainError>>()?;
+        let best = followed.into_iter().min_by(|a, b| a.0.total_cmp(&b.0));
+        Ok(best.map(|(_, fit)| (reference, fit)))
+    }
+
+    /// Loss of Gaussians that are made anew from all poses of a fit: where it was followed wrongly, poses that each explain
+    /// their time contradict each other.
+    fn carved_loss(&self, fit: &Fit<'a>, views: &[usize]) -> Result<f64, TrainError> {
+        let mut rng = self.rng();
+        let Some(shape) = self.hull(&fit.poses, FOLLOWED, &mut rng) else { return Ok(f64::INFINITY) };
+        let mut again = self.fit(fit.poses.clone(), shape, rng);
+        again.air.clone_from(&fit.air);
+        let level = again.trial_level();
+        let (steps, pose_rate) = CARVED;
+        again.steps(views, steps, |share| (if share < 0.5 { 1.0 } else { 0.5 }, pose_rate, level));
+        self.surroundings.phases.check()?;
+        Ok(again.mean_loss(views, level))
+    }
+
+    /// Time from which an object is followed to others of its path, among `times`, and the object there, as it may be: as it
+    /// stands before it is lifted, and after; where it looks from one side to the next as if it did not turn; else as one
+    /// time shows it.
+    pub(super) fn starts(
+        &self,
+        path: &BTreeMap<usize, DVec3>,
+        times: &[usize],
+    ) -> Option<(usize, Vec<Fit<'a>>)> {
         let at = |place: DVec3| Pose { rotation: DQuat::IDENTITY, translation: place };
-        let at_rest = self.runs_at_rest(path).into_iter().max_by_key(Vec::len).unwrap_or_default();
-        let at_rest: Vec<usize> = at_rest.into_iter().filter(|time| times.contains(time)).collect();
+        let mut rests = self.runs_at_rest(path);
+        rests.iter_mut().for_each(|rest| rest.retain(|time| times.contains(time)));
+        rests.sort_by_key(|rest| std::cmp::Reverse(rest.len()));
+        let at_rest = if rests.is_empty() { Vec::new() } else { rests.remove(0) };
         let reference = self.best_seen(if at_rest.is_empty() { times } else { &at_rest }.iter().copied())?;
         let mut poses = BTreeMap::from([(reference, at(path[&reference]))]);
+        let is_one_camera = is_one_camera(self.views);
         if !at_rest.is_empty() {
             let middle = at_rest.iter().map(|time| path[time]).sum::<DVec3>() / at_rest.len() as f64;
             poses.extend(at_rest.iter().map(|time| (*time, at(middle))));
-        } else if self.outline.is_surrounded && is_one_camera(self.views) {
+        } else if self.outline.is_surrounded && is_one_camera {
             let mut near = times.to_vec();
             near.sort_by_key(|time| time.abs_diff(reference));
             poses.extend(near.iter().take(TOGETHER).map(|time| (*time, at(path[time]))));
         }
+        let poses = if is_one_camera { self.with_rests(poses, &rests, path) } else { vec![poses] };
         let upright = self.outline.upright(self.surroundings.plane);
         let size = self.outline.size();
-        let shape = self.hull_within(&poses, size, Some(&upright), FOLLOWED, &mut self.rng())?;
-        let mut fit = self.fit(poses, shape, self.rng());
-        fit.air = self.may_be_off(path);
-        Some((reference, fit))
+        let start = |poses: BTreeMap<usize, Pose>| {
+            let shape = self.hull_within(&poses, size, Some(&upright), FOLLOWED, &mut self.rng())?;
+            let mut fit = self.fit(poses, shape, self.rng());
+            fit.air = self.may_be_off(path);
+            Some(fit)
+        };
+        Some((reference, poses.into_iter().filter_map(start).collect()))
     }
 
     /// Runs of times at which an object stands in one place on its support.

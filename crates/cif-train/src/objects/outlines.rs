@@ -5,9 +5,11 @@ use std::collections::BTreeMap;
 
 use glam::{DMat2, DVec2, DVec3};
 
+use super::object;
 use super::outline::{Outline, RAISED, ROOM};
 use super::path;
 use super::plane::Plane;
+use super::sequence::between;
 use super::view::{ObjectView, WITHIN, are_discs, is_at_rest, is_one_camera, median, meeting_point};
 
 /// Largest apparent size of a mask, relative to that on the plane, at which its object is taken to touch the plane.
@@ -255,10 +257,13 @@ fn on_plane(views: &[ObjectView], plane: &Plane, stance: Stance) -> Option<Outli
         heights = steady_heights(views, plane, medians.height)?;
         medians.height = heights.iter().copied().fold(0.0, f64::max);
     }
+    let rests =
+        if leaves && !is_ball { sizes_at_rest(views, plane, &medians, in_contact) } else { BTreeMap::new() };
     let mut sums: BTreeMap<usize, (DVec3, f64, bool)> = BTreeMap::new();
     for ((view, size), height) in views.iter().zip(steady_sizes(views, plane, medians.height)).zip(heights) {
         let ray = view.camera.ray(view.centroid);
         let Some(mut depth) = plane.meet(view.camera.centre(), ray, height) else { continue };
+        let in_contact = if rests.is_empty() { in_contact } else { between(&rests, view.time_index) };
         if leaves
             && let Some(size) = size
             && size > in_contact
@@ -286,6 +291,53 @@ fn on_plane(views: &[ObjectView], plane: &Plane, stance: Stance) -> Option<Outli
         guessed: Vec::new(),
         is_resort: false,
     })
+}
+
+/// Sizes, by time, that the masks of an object before one camera imply where it rests on the plane: its masks stay in one
+/// place on it, or move less than half as far as they would if it were as far off as its size tells, of that in contact,
+/// while the camera travels.
+fn sizes_at_rest(
+    views: &[ObjectView],
+    plane: &Plane,
+    reading: &Reading,
+    in_contact: f64,
+) -> BTreeMap<usize, f64> {
+    let mut found = BTreeMap::new();
+    if !is_one_camera(views) {
+        return found;
+    }
+    let placed = |(view, size): (&ObjectView, Option<f64>)| {
+        let (centre, ray) = (view.camera.centre(), view.camera.ray(view.centroid));
+        let place = centre + plane.meet(centre, ray, reading.height)? * ray;
+        Some(Placed { time: view.time_index, size: size?, centre, place })
+    };
+    let sizes = steady_sizes(views, plane, reading.height);
+    let placed: Vec<Placed> = views.iter().zip(sizes).filter_map(placed).collect();
+    let step = object::STANDS * reading.height.max(reading.radius);
+    let stands = |a: &Placed, b: &Placed| (b.place - a.place).length() < step * (b.time - a.time) as f64;
+    for row in placed.chunk_by(stands).filter(|row| row.len() >= SHORTEST_RUN) {
+        let (first, last) = (&row[0], &row[row.len() - 1]);
+        let size = median(&mut row.iter().map(|at| at.size).collect::<Vec<_>>());
+        let travelled = last.centre - first.centre;
+        let along = (travelled - plane.normal * plane.normal.dot(travelled)).length();
+        // By similar triangles: nearer by this share, it is above where it stands by as much of the height of the camera.
+        let shifts = along * (size / in_contact - 1.0);
+        if size < AIR * in_contact || (last.place - first.place).length() < 0.5 * shifts {
+            found.extend(row.iter().map(|at| (at.time, at.size)));
+        }
+    }
+    found
+}
+
+/// A mask as if its object stood on the plane.
+struct Placed {
+    time: usize,
+    /// Size that it implies.
+    size: f64,
+    /// Of the camera.
+    centre: DVec3,
+    /// Of the object.
+    place: DVec3,
 }
 
 /// Size that a mask implies if its object stands on the plane: the root of its area at that distance.
@@ -461,6 +513,36 @@ mod tests {
             views(solid(&sphere_places(RADIUS), |_| [0.8, 0.5, 0.2], 0.006), &[at_rest; TIMES], cameras);
         all.retain(|view| view.time_index < times);
         all
+    }
+
+    #[test]
+    fn what_looks_larger_where_it_rests_is_not_off_its_support() {
+        // A block that stands with its broad side to the camera, is lifted, and put down with its narrow side to it.
+        let size = DVec3::new(0.045, 0.025, 0.05);
+        let mut rng = stream(0, Purpose::Objects, 31);
+        let places: Vec<DVec3> = (0..1500)
+            .map(|k| {
+                let mut p = size * (2.0 * DVec3::from(std::array::from_fn(|_| rng.random::<f64>())) - 1.0);
+                p[k % 3] = if (k / 3) % 2 == 0 { size[k % 3] } else { -size[k % 3] };
+                p
+            })
+            .collect();
+        let pose = |time: usize| {
+            let share = ((time as f64 - 9.0) / 10.0).clamp(0.0, 1.0);
+            let up = 0.1 * (std::f64::consts::PI * share).sin();
+            let turn = DQuat::from_rotation_z(0.5 + 1.9 * share);
+            (turn, DVec3::new(0.1 * share - 0.05, 0.0, size.z + up))
+        };
+        let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(pose).collect();
+        let views = views(solid(&places, |_| [0.8, 0.5, 0.2], 0.006), &truth, moving);
+        let found = outlines(&views, Some(&FLOOR), TIMES);
+        let leaves = found.iter().find(|outline| !outline.air.is_empty()).unwrap();
+        assert!((0..9).chain(21..TIMES).all(|time| !leaves.air.contains(&time)), "{:?}", leaves.air);
+        assert!((12..17).all(|time| leaves.air.contains(&time)), "{:?}", leaves.air);
+        for mut rest in [0..9, 21..TIMES] {
+            let first = leaves.path[&rest.start];
+            assert!(rest.all(|time| leaves.path[&time].distance(first) < 0.01), "{:?}", leaves.path);
+        }
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! Values over time, of which each time prefers some and neighbours are alike: the sequence that costs least.
 
+use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 
 /// The sequence of places in the rows of a table whose sum is least, of the values there and of the cost of going from a
@@ -38,6 +39,17 @@ pub(super) fn unwind<'v>(angles: impl Iterator<Item = &'v mut f64>) {
             *angle += ((last - *angle) / TAU).round() * TAU;
         }
         last = Some(*angle);
+    }
+}
+
+/// Value at a time between those of others, or that of the nearest; 0 where there are none.
+pub(super) fn between(values: &BTreeMap<usize, f64>, time: usize) -> f64 {
+    let before = values.range(..=time).next_back();
+    let after = values.range(time..).next();
+    match (before, after) {
+        (Some((a, x)), Some((b, y))) if b > a => x + (y - x) * (time - a) as f64 / (b - a) as f64,
+        (Some((_, x)), _) | (_, Some((_, x))) => *x,
+        (None, None) => 0.0,
     }
 }
 

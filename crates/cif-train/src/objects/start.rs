@@ -12,7 +12,6 @@ use serde::{Deserialize, Serialize};
 
 use super::bend;
 use super::fit::{Fit, Turns};
-use super::follow::follow;
 use super::grow::grow;
 use super::mend::{mend, onto_masks};
 use super::object::{FOLLOWED, Object, Started};
@@ -188,11 +187,11 @@ impl<'a> Object<'a> {
 
     /// An object that is mostly cut or hidden, followed from time to time.
     fn followed(&self, path: BTreeMap<usize, DVec3>) -> Result<Option<Started<'a>>, TrainError> {
-        let times: Vec<usize> = path.keys().copied().collect();
-        let first = self.first(&path, &times).filter(|_| path.len() >= FEWEST_SEEN);
-        let Some((reference, mut fit)) = first else { return Ok(None) };
+        if path.len() < FEWEST_SEEN {
+            return Ok(None);
+        }
         let all: Vec<usize> = self.views_at(&path).collect();
-        follow(&mut fit, reference, &path, &all, self.surroundings.phases)?;
+        let Some((reference, mut fit)) = self.followed_along(&path, &all, None)? else { return Ok(None) };
         let error = fit.mean_loss(&all, 0);
         let stays = |bent: f64| bent <= trials::BENDS_IN_PLACE * error;
         if !self.is_declared && self.bent_in_place(&all).is_some_and(stays) {

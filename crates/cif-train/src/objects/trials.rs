@@ -11,7 +11,6 @@ use rayon::prelude::*;
 use super::ball;
 use super::bend;
 use super::fit::{Fit, Turns};
-use super::follow::follow;
 use super::object::{Object, Started};
 use super::outline::Outline;
 use super::path::smooth;
@@ -405,17 +404,12 @@ impl<'a> Contest<'a> {
         simple.iter().all(|trial| trial.losses[1] > least)
     }
 
-    /// The object followed over known times: on its support where its path is, and off it if that explains more where
+    /// The object followed over the times of views that are fitted to: on its support where its path is, and off it if that explains more where
     /// it is not at rest, as of what is lifted and tilted, so that its size does not show it.
-    fn follow(&self, known: &[usize]) -> Result<Option<Fit<'a>>, TrainError> {
+    fn follow(&self) -> Result<Option<Fit<'a>>, TrainError> {
         let (object, along) = (self.object, &self.paths.along);
-        let followed = |air: Option<Vec<usize>>| -> Result<Option<Fit<'a>>, TrainError> {
-            let Some((reference, mut fit)) = object.first(along, known) else { return Ok(None) };
-            fit.air = air.unwrap_or(fit.air);
-            follow(&mut fit, reference, along, &self.views.train, object.surroundings.phases)?;
-            Ok(Some(fit))
-        };
-        let Some(mut on) = followed(None)? else { return Ok(None) };
+        let followed = |off: Option<&[usize]>| object.followed_along(along, &self.views.train, off);
+        let Some((_, mut on)) = followed(None)? else { return Ok(None) };
         let at_rest: Vec<usize> = object.runs_at_rest(along).into_iter().flatten().collect();
         let (resting, moving): (Vec<usize>, Vec<usize>) =
             self.views.train.iter().partition(|view| at_rest.contains(&object.views[**view].time_index));
@@ -427,8 +421,8 @@ impl<'a> Contest<'a> {
         if error < STRAINED * on.mean_loss(&resting, level) {
             return Ok(Some(on));
         }
-        let moves = along.keys().copied().filter(|time| !at_rest.contains(time));
-        let Some(mut off) = followed(Some(moves.collect()))? else { return Ok(Some(on)) };
+        let moves: Vec<usize> = along.keys().copied().filter(|time| !at_rest.contains(time)).collect();
+        let Some((_, mut off)) = followed(Some(&moves))? else { return Ok(Some(on)) };
         let gains = off.mean_loss(&moving, level) < OFF_GAIN * error;
         Ok(Some(if gains { off } else { on }))
     }
@@ -436,11 +430,10 @@ impl<'a> Contest<'a> {
     /// All other ways along the path, in addition to the simple ones.
     fn along_the_path(&mut self, simple: Vec<Trial<'a>>) -> Result<Vec<Trial<'a>>, TrainError> {
         let mut trials = simple;
-        if self.may_be_followed() {
-            let known = times_of(self.object.views, &self.views.train);
-            if let Some(fit) = self.follow(&known)? {
-                (self.paths.followed, self.paths.off) = (Some(fit.poses), fit.air);
-            }
+        if self.may_be_followed()
+            && let Some(fit) = self.follow()?
+        {
+            (self.paths.followed, self.paths.off) = (Some(fit.poses), fit.air);
         }
         let ways = if self.object.place > 0 && self.paths.followed.is_some() {
             vec![Way::Followed]

@@ -9,6 +9,7 @@ use rand::seq::SliceRandom;
 use rand_pcg::Pcg64;
 use serde::{Deserialize, Serialize};
 
+use super::super::sequence::between;
 use super::super::shape::{Adam, Pose, Shape};
 use super::super::view::ObjectView;
 
@@ -247,15 +248,4 @@ impl<'a> Body<'a> {
 /// Least and largest value; infinities where there are none.
 pub(super) fn range(values: &BTreeMap<usize, f64>) -> (f64, f64) {
     values.values().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)))
-}
-
-/// Value at a time between those of others, or that of the nearest.
-pub(super) fn between(values: &BTreeMap<usize, f64>, time: usize) -> f64 {
-    let before = values.range(..=time).next_back();
-    let after = values.range(time..).next();
-    match (before, after) {
-        (Some((a, x)), Some((b, y))) if b > a => x + (y - x) * (time - a) as f64 / (b - a) as f64,
-        (Some((_, x)), _) | (_, Some((_, x))) => *x,
-        (None, None) => 0.0,
-    }
 }

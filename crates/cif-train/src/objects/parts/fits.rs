@@ -7,8 +7,9 @@ use cif_field::tracks::JointKind;
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
+use super::super::sequence::between;
 use super::super::shape::{Pose, Shape};
-use super::body::{Body, Hinge, Part, between, range};
+use super::body::{Body, Hinge, Part, range};
 use super::guesses::{Guess, JointValues};
 use super::promise::LOOKS;
 use super::scope::Search;
