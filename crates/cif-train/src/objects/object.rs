@@ -14,7 +14,6 @@ use super::order::Order;
 use super::outline::Outline;
 use super::plane::Plane;
 use super::shape::{Pose, Shape};
-use super::split::times_of;
 use super::view::{ObjectView, is_one_camera, meeting_point};
 use super::ways::Way;
 use crate::error::TrainError;
@@ -83,6 +82,15 @@ pub(super) struct Started<'a> {
     pub(super) bent: Option<f64>,
     /// Time that shows most of it.
     pub(super) reference: usize,
+}
+
+/// Where an object is followed from.
+pub(super) struct Starts {
+    /// Time that shows most of it, among those of every start.
+    pub(super) reference: usize,
+    /// Poses by time, as they may be: as it stands before it is lifted, and after; where it looks from one side to the next
+    /// as if it did not turn; else as one time shows it.
+    pub(super) poses: Vec<BTreeMap<usize, Pose>>,
 }
 
 impl<'a> Object<'a> {
@@ -165,34 +173,30 @@ impl<'a> Object<'a> {
         times.max_by(|a, b| seen(a).total_cmp(&seen(b)))
     }
 
-    /// The object followed over the times of views, along a path; off its support at times that are given, or at those at
-    /// which its outline may be off. With the time that it is followed from, which shows most of it.
+    /// The object followed over the times of views, along a path, from the best of some starts; off its support at times
+    /// that are given, or at those at which its outline may be off. `None` where no start shows it.
     ///
     /// # Errors
     /// [`TrainError::Stopped`] when the run is to stop.
-    pub(super) fn followed_along(
+    pub(super) fn followed_from(
         &self,
+        starts: &Starts,
         path: &BTreeMap<usize, DVec3>,
         views: &[usize],
         off: Option<&[usize]>,
-    ) -> Result<Option<(usize, Fit<'a>)>, TrainError> {
-        let phases = self.surroundings.phases;
-        let Some((reference, starts)) = self.starts(path, &times_of(self.views, views)) else {
-            return Ok(None);
-        };
-        let is_one_of_several = starts.len() > 1;
-        let followed = |mut fit: Fit<'a>| -> Result<(f64, Fit<'a>), TrainError> {
+    ) -> Result<Option<Fit<'a>>, TrainError> {
+        let followed = |poses: &BTreeMap<usize, Pose>| -> Result<Option<(f64, Fit<'a>)>, TrainError> {
+            let Some(mut fit) = self.started(poses, path) else { return Ok(None) };
             if let Some(off) = off {
                 fit.air = off.to_vec();
             }
-            follow(&mut fit, reference, path, views, phases)?;
-            let loss = if is_one_of_several { self.carved_loss(&fit, views)? } else { 0.0 };
-            Ok((loss, fit))
+            follow(&mut fit, starts.reference, path, views, self.surroundings.phases)?;
+            let loss = if starts.poses.len() > 1 { self.carved_loss(&fit, views)? } else { 0.0 };
+            Ok(Some((loss, fit)))
         };
-        let followed: Vec<(f64, Fit<'a>)> =
-            starts.into_par_iter().map(followed).collect::<Result<_, TrainError>>()?;
-        let best = followed.into_iter().min_by(|a, b| a.0.total_cmp(&b.0));
-        Ok(best.map(|(_, fit)| (reference, fit)))
+        let followed = starts.poses.par_iter().map(followed).collect::<Result<Vec<_>, TrainError>>()?;
+        let best = followed.into_iter().flatten().min_by(|a, b| a.0.total_cmp(&b.0));
+        Ok(best.map(|(_, fit)| fit))
     }
 
     /// Loss of Gaussians that are made anew from all poses of a fit: where it was followed wrongly, poses that each explain
@@ -209,14 +213,8 @@ impl<'a> Object<'a> {
         Ok(again.mean_loss(views, level))
     }
 
-    /// Time from which an object is followed to others of its path, among `times`, and the object there, as it may be: as it
-    /// stands before it is lifted, and after; where it looks from one side to the next as if it did not turn; else as one
-    /// time shows it.
-    pub(super) fn starts(
-        &self,
-        path: &BTreeMap<usize, DVec3>,
-        times: &[usize],
-    ) -> Option<(usize, Vec<Fit<'a>>)> {
+    /// Where an object is followed from to other times of its path, among `times`; `None` without any.
+    pub(super) fn starts(&self, path: &BTreeMap<usize, DVec3>, times: &[usize]) -> Option<Starts> {
         let at = |place: DVec3| Pose { rotation: DQuat::IDENTITY, translation: place };
         let mut rests = self.runs_at_rest(path);
         rests.iter_mut().for_each(|rest| rest.retain(|time| times.contains(time)));
@@ -234,15 +232,21 @@ impl<'a> Object<'a> {
             poses.extend(near.iter().take(TOGETHER).map(|time| (*time, at(path[time]))));
         }
         let poses = if is_one_camera { self.with_rests(poses, &rests, path) } else { vec![poses] };
+        Some(Starts { reference, poses })
+    }
+
+    /// The object as it is before it is followed from poses; `None` where these contradict its masks.
+    pub(super) fn started(
+        &self,
+        poses: &BTreeMap<usize, Pose>,
+        path: &BTreeMap<usize, DVec3>,
+    ) -> Option<Fit<'a>> {
         let upright = self.outline.upright(self.surroundings.plane);
         let size = self.outline.size();
-        let start = |poses: BTreeMap<usize, Pose>| {
-            let shape = self.hull_within(&poses, size, Some(&upright), FOLLOWED, &mut self.rng())?;
-            let mut fit = self.fit(poses, shape, self.rng());
-            fit.air = self.may_be_off(path);
-            Some(fit)
-        };
-        Some((reference, poses.into_iter().filter_map(start).collect()))
+        let shape = self.hull_within(poses, size, Some(&upright), FOLLOWED, &mut self.rng())?;
+        let mut fit = self.fit(poses.clone(), shape, self.rng());
+        fit.air = self.may_be_off(path);
+        Some(fit)
     }
 
     /// Runs of times at which an object stands in one place on its support.

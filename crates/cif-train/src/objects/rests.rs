@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
-use super::object::{FOLLOWED, Object};
+use super::object::Object;
 use super::plane::Plane;
 use super::shape::Pose;
 
@@ -73,13 +73,13 @@ impl Object<'_> {
             let rotation = DQuat::from_axis_angle(plane.normal, (degrees as f64).to_radians());
             rest.iter().map(|time| (*time, Pose { rotation, translation: place })).collect()
         };
-        let Some((one, other)) = self.posed_loss(poses).zip(self.posed_loss(&at(0))) else {
+        let Some((one, other)) = self.posed_loss(poses, path).zip(self.posed_loss(&at(0), path)) else {
             return Vec::new();
         };
         let with = |turn: usize| {
             let mut poses = poses.clone();
             poses.extend(at(turn));
-            let loss = self.posed_loss(&poses)?;
+            let loss = self.posed_loss(&poses, path)?;
             Some(Posed { poses, loss, turn })
         };
         let turns: Vec<usize> = (0..360).step_by(TURNS).collect();
@@ -88,12 +88,9 @@ impl Object<'_> {
         tried
     }
 
-    /// Mean loss of Gaussians that are fitted to the views in poses; `None` where these contradict each other.
-    fn posed_loss(&self, poses: &BTreeMap<usize, Pose>) -> Option<f64> {
-        let upright = self.outline.upright(self.surroundings.plane);
-        let mut rng = self.rng();
-        let shape = self.hull_within(poses, self.outline.size(), Some(&upright), FOLLOWED, &mut rng)?;
-        let mut fit = self.fit(poses.clone(), shape, rng);
+    /// Mean loss of Gaussians that are fitted to the views in poses; `None` where these contradict the masks.
+    fn posed_loss(&self, poses: &BTreeMap<usize, Pose>, path: &BTreeMap<usize, DVec3>) -> Option<f64> {
+        let mut fit = self.started(poses, path)?;
         let views: Vec<usize> = self.views_at(poses).collect();
         let level = fit.trial_level();
         fit.steps(&views, STEPS, |share| (if share < 0.5 { 1.0 } else { 0.5 }, 0.0, level));
@@ -156,15 +153,14 @@ mod tests {
             let object = objects.iter().find(|object| !object.outline.air.is_empty()).unwrap();
             let path = smooth(&object.outline.path, &views, TIMES, object.outline);
             let all: Vec<usize> = object.views_at(&path).collect();
-            let (_, starts) = object.starts(&path, &times_of(&views, &all)).unwrap();
+            let starts = object.starts(&path, &times_of(&views, &all)).unwrap().poses;
             let turn = |poses: &BTreeMap<usize, Pose>| {
                 let (first, last) = (poses.values().next().unwrap(), poses.values().next_back().unwrap());
                 (last.rotation * first.rotation.inverse()).to_scaled_axis().z.to_degrees().rem_euclid(360.0)
             };
-            let both = starts
-                .iter()
-                .filter(|fit| fit.poses.contains_key(&0) && fit.poses.contains_key(&(TIMES - 1)));
-            both.map(|fit| turn(&fit.poses)).collect()
+            let both =
+                starts.iter().filter(|poses| poses.contains_key(&0) && poses.contains_key(&(TIMES - 1)));
+            both.map(turn).collect()
         })
     }
 

@@ -191,7 +191,9 @@ impl<'a> Object<'a> {
             return Ok(None);
         }
         let all: Vec<usize> = self.views_at(&path).collect();
-        let Some((reference, mut fit)) = self.followed_along(&path, &all, None)? else { return Ok(None) };
+        let Some(starts) = self.starts(&path, &times_of(self.views, &all)) else { return Ok(None) };
+        let Some(mut fit) = self.followed_from(&starts, &path, &all, None)? else { return Ok(None) };
+        let reference = starts.reference;
         let error = fit.mean_loss(&all, 0);
         let stays = |bent: f64| bent <= trials::BENDS_IN_PLACE * error;
         if !self.is_declared && self.bent_in_place(&all).is_some_and(stays) {

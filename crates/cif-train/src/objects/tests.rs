@@ -367,8 +367,8 @@ fn supports_hold_objects_whose_distance_nothing_else_shows() {
             let of = |object: &Object<'_>| {
                 let path = &object.outline.path;
                 let times: Vec<usize> = path.keys().copied().collect();
-                let (_, fits) = object.starts(path, &times).unwrap();
-                let fit = &fits[0];
+                let starts = object.starts(path, &times).unwrap();
+                let fit = object.started(&starts.poses[0], path).unwrap();
                 (object.outline.is_surrounded, fit.is_held())
             };
             objects.iter().map(of).collect()

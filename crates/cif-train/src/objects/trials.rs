@@ -404,15 +404,17 @@ impl<'a> Contest<'a> {
         simple.iter().all(|trial| trial.losses[1] > least)
     }
 
-    /// The object followed over the times of views that are fitted to: on its support where its path is, and off it if that explains more where
-    /// it is not at rest, as of what is lifted and tilted, so that its size does not show it.
+    /// The object followed over the times of views that are fitted to: on its support where its path is, and off it if that
+    /// explains more where it is not at rest, as of what is lifted and tilted, so that its size does not show it.
     fn follow(&self) -> Result<Option<Fit<'a>>, TrainError> {
         let (object, along) = (self.object, &self.paths.along);
-        let followed = |off: Option<&[usize]>| object.followed_along(along, &self.views.train, off);
-        let Some((_, mut on)) = followed(None)? else { return Ok(None) };
+        let views = &self.views.train;
+        let Some(starts) = object.starts(along, &times_of(object.views, views)) else { return Ok(None) };
+        let followed = |off: Option<&[usize]>| object.followed_from(&starts, along, views, off);
+        let Some(mut on) = followed(None)? else { return Ok(None) };
         let at_rest: Vec<usize> = object.runs_at_rest(along).into_iter().flatten().collect();
         let (resting, moving): (Vec<usize>, Vec<usize>) =
-            self.views.train.iter().partition(|view| at_rest.contains(&object.views[**view].time_index));
+            views.iter().partition(|view| at_rest.contains(&object.views[**view].time_index));
         if resting.is_empty() || !on.air.is_empty() || !on.is_held() {
             return Ok(Some(on));
         }
@@ -422,7 +424,7 @@ impl<'a> Contest<'a> {
             return Ok(Some(on));
         }
         let moves: Vec<usize> = along.keys().copied().filter(|time| !at_rest.contains(time)).collect();
-        let Some((_, mut off)) = followed(Some(&moves))? else { return Ok(Some(on)) };
+        let Some(mut off) = followed(Some(&moves))? else { return Ok(Some(on)) };
         let gains = off.mean_loss(&moving, level) < OFF_GAIN * error;
         Ok(Some(if gains { off } else { on }))
     }
