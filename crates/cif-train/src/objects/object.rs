@@ -30,6 +30,10 @@ pub(super) const STANDS: f64 = 0.03;
 /// Steps of Gaussians that are made anew from where an object was followed to, and rate of poses meanwhile.
 const CARVED: (usize, f64) = (600, 0.3);
 
+/// Loss of what was followed from another start, of the best, up to which it explains as much, and the turn from which it is
+/// another motion, degrees.
+const RIVAL: (f64, f64) = (1.02, 30.0);
+
 /// Gaussians of an object that is followed.
 pub(super) const FOLLOWED: usize = 300;
 
@@ -82,6 +86,13 @@ pub(super) struct Started<'a> {
     pub(super) bent: Option<f64>,
     /// Time that shows most of it.
     pub(super) reference: usize,
+}
+
+/// An object that was followed.
+pub(super) struct Followed<'a> {
+    pub(super) fit: Fit<'a>,
+    /// True where no other start leads to other turns that explain as much.
+    pub(super) is_decided: bool,
 }
 
 /// Where an object is followed from.
@@ -184,7 +195,7 @@ impl<'a> Object<'a> {
         path: &BTreeMap<usize, DVec3>,
         views: &[usize],
         off: Option<&[usize]>,
-    ) -> Result<Option<Fit<'a>>, TrainError> {
+    ) -> Result<Option<Followed<'a>>, TrainError> {
         let followed = |poses: &BTreeMap<usize, Pose>| -> Result<Option<(f64, Fit<'a>)>, TrainError> {
             let Some(mut fit) = self.started(poses, path) else { return Ok(None) };
             if let Some(off) = off {
@@ -195,8 +206,19 @@ impl<'a> Object<'a> {
             Ok(Some((loss, fit)))
         };
         let followed = starts.poses.par_iter().map(followed).collect::<Result<Vec<_>, TrainError>>()?;
-        let best = followed.into_iter().flatten().min_by(|a, b| a.0.total_cmp(&b.0));
-        Ok(best.map(|(_, fit)| fit))
+        let mut followed: Vec<(f64, Fit<'a>)> = followed.into_iter().flatten().collect();
+        followed.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let Some((best, others)) = followed.split_first() else { return Ok(None) };
+        let is_rival = |(loss, fit): &(f64, Fit<'a>)| {
+            let turned = |(time, pose): (&usize, &Pose)| {
+                let other = fit.poses.get(time)?.rotation;
+                Some(pose.rotation.angle_between(other).to_degrees())
+            };
+            let apart = best.1.poses.iter().filter_map(turned).fold(0.0, f64::max);
+            *loss <= RIVAL.0 * best.0 && apart > RIVAL.1
+        };
+        let is_decided = !others.iter().any(is_rival);
+        Ok(followed.into_iter().next().map(|(_, fit)| Followed { fit, is_decided }))
     }
 
     /// Loss of Gaussians that are made anew from all poses of a fit: where it was followed wrongly, poses that each explain

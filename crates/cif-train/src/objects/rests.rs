@@ -19,8 +19,8 @@ const TURNS: usize = 15;
 const STEPS: usize = 120;
 
 /// Turns that are kept, and degrees between them. Of objects that are carried in five random captures the right one was among
-/// three, mostly not the first: what decides is how well it is followed from there.
-const KEPT: usize = 3;
+/// four, mostly not the first: what decides is how well it is followed from there.
+const KEPT: usize = 4;
 const APART: usize = 30;
 
 /// Loss of two rests together, of their mean by themselves, beyond which an object does not stand upright at both: twice.
@@ -91,6 +91,7 @@ impl Object<'_> {
     /// Mean loss of Gaussians that are fitted to the views in poses; `None` where these contradict the masks.
     fn posed_loss(&self, poses: &BTreeMap<usize, Pose>, path: &BTreeMap<usize, DVec3>) -> Option<f64> {
         let mut fit = self.started(poses, path)?;
+        fit.air.clone_from(&self.outline.air);
         let views: Vec<usize> = self.views_at(poses).collect();
         let level = fit.trial_level();
         fit.steps(&views, STEPS, |share| (if share < 0.5 { 1.0 } else { 0.5 }, 0.0, level));

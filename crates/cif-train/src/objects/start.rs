@@ -14,7 +14,7 @@ use super::bend;
 use super::fit::{Fit, Turns};
 use super::grow::grow;
 use super::mend::{mend, onto_masks};
-use super::object::{FOLLOWED, Object, Started};
+use super::object::{FOLLOWED, Followed, Object, Started};
 use super::path::smooth;
 use super::plane::Plane;
 use super::rotation::shown;
@@ -192,14 +192,15 @@ impl<'a> Object<'a> {
         }
         let all: Vec<usize> = self.views_at(&path).collect();
         let Some(starts) = self.starts(&path, &times_of(self.views, &all)) else { return Ok(None) };
-        let Some(mut fit) = self.followed_from(&starts, &path, &all, None)? else { return Ok(None) };
+        let Some(followed) = self.followed_from(&starts, &path, &all, None)? else { return Ok(None) };
+        let Followed { mut fit, is_decided } = followed;
         let reference = starts.reference;
         let error = fit.mean_loss(&all, 0);
         let stays = |bent: f64| bent <= trials::BENDS_IN_PLACE * error;
         if !self.is_declared && self.bent_in_place(&all).is_some_and(stays) {
             return Ok(None);
         }
-        let rotation = if self.shows(&path, &fit.poses) {
+        let rotation = if is_decided && self.shows(&path, &fit.poses) {
             RotationEvidence::Observed
         } else {
             RotationEvidence::Assumed

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use super::ball;
 use super::bend;
 use super::fit::{Fit, Turns};
-use super::object::{Object, Started};
+use super::object::{Followed, Object, Started};
 use super::outline::Outline;
 use super::path::smooth;
 use super::rotation::{Course, Revolving, Shown, shown};
@@ -125,6 +125,8 @@ struct Contest<'a> {
     views: SplitViews,
     /// Times of which no view is fitted to, so that their poses lie between those of others.
     between: Vec<usize>,
+    /// True where following leads to other turns from another start, which explain as much.
+    is_undecided: bool,
 }
 
 /// Trials of resting and of sliding without a turn, in numbers.
@@ -187,7 +189,8 @@ pub(super) fn best_way<'a>(
         Some(is_shown) if way == Way::Followed => is_shown,
         _ => contest.shows(way, &fit.poses),
     };
-    let rotation = if is_shown { rotation } else { RotationEvidence::Assumed };
+    let is_decided = way != Way::Followed || !contest.is_undecided;
+    let rotation = if is_shown && is_decided { rotation } else { RotationEvidence::Assumed };
     // Light, which stays where it is, argues against rolling: how rigid it is shows where it does not turn, too.
     let error = unturned.filter(|_| way == Way::Lies).map_or(error, |unturned| unturned.min(error));
     let reference = contest.paths.reference;
@@ -221,6 +224,7 @@ impl<'a> Contest<'a> {
             },
             reliable: reliable.to_vec(),
             views: split,
+            is_undecided: false,
         }
     }
 
@@ -406,7 +410,7 @@ impl<'a> Contest<'a> {
 
     /// The object followed over the times of views that are fitted to: on its support where its path is, and off it if that
     /// explains more where it is not at rest, as of what is lifted and tilted, so that its size does not show it.
-    fn follow(&self) -> Result<Option<Fit<'a>>, TrainError> {
+    fn follow(&self) -> Result<Option<Followed<'a>>, TrainError> {
         let (object, along) = (self.object, &self.paths.along);
         let views = &self.views.train;
         let Some(starts) = object.starts(along, &times_of(object.views, views)) else { return Ok(None) };
@@ -415,17 +419,17 @@ impl<'a> Contest<'a> {
         let at_rest: Vec<usize> = object.runs_at_rest(along).into_iter().flatten().collect();
         let (resting, moving): (Vec<usize>, Vec<usize>) =
             views.iter().partition(|view| at_rest.contains(&object.views[**view].time_index));
-        if resting.is_empty() || !on.air.is_empty() || !on.is_held() {
+        if resting.is_empty() || !on.fit.air.is_empty() || !on.fit.is_held() {
             return Ok(Some(on));
         }
-        let level = on.trial_level();
-        let error = on.mean_loss(&moving, level);
-        if error < STRAINED * on.mean_loss(&resting, level) {
+        let level = on.fit.trial_level();
+        let error = on.fit.mean_loss(&moving, level);
+        if error < STRAINED * on.fit.mean_loss(&resting, level) {
             return Ok(Some(on));
         }
         let moves: Vec<usize> = along.keys().copied().filter(|time| !at_rest.contains(time)).collect();
         let Some(mut off) = followed(Some(&moves))? else { return Ok(Some(on)) };
-        let gains = off.mean_loss(&moving, level) < OFF_GAIN * error;
+        let gains = off.fit.mean_loss(&moving, level) < OFF_GAIN * error;
         Ok(Some(if gains { off } else { on }))
     }
 
@@ -433,9 +437,10 @@ impl<'a> Contest<'a> {
     fn along_the_path(&mut self, simple: Vec<Trial<'a>>) -> Result<Vec<Trial<'a>>, TrainError> {
         let mut trials = simple;
         if self.may_be_followed()
-            && let Some(fit) = self.follow()?
+            && let Some(Followed { fit, is_decided }) = self.follow()?
         {
             (self.paths.followed, self.paths.off) = (Some(fit.poses), fit.air);
+            self.is_undecided = !is_decided;
         }
         let ways = if self.object.place > 0 && self.paths.followed.is_some() {
             vec![Way::Followed]
