@@ -3,15 +3,21 @@
 
 use std::collections::BTreeMap;
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 
 use super::fit::Fit;
 use super::mend::settled;
 use super::shape::Pose;
-use super::view::look_alike;
+use super::view::{ObjectView, look_alike};
 
 /// Places that are moved onto masks, of those that a time may have.
 const TRIED: usize = 2;
+
+/// Distances from the middle of a mask beyond the border that cuts it, of the size of the object, at which its middle may be.
+const BEYOND: [f64; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
+
+/// Loss, of that where the object is not drawn at all, beyond which a pose does not explain its masks.
+const MISSED: f64 = 0.5;
 
 /// Adds the times that are seen, but not reliable, nearest first: where their masks are, near where their neighbours or
 /// the path lead.
@@ -35,11 +41,15 @@ pub(super) fn grow(fit: &mut Fit<'_>, path: &BTreeMap<usize, DVec3>) {
             fit.poses.insert(time, pose);
             continue;
         }
-        let guesses = led(fit, time, path);
+        let mut guesses = led(fit, time, path);
         let Some(first) = guesses.first().copied() else { continue };
         let shows_place =
             |view: &usize| fit.views[*view].time_index == time && fit.views[*view].shows_place();
         let views: Vec<usize> = (0..fit.views.len()).filter(shows_place).collect();
+        if is_missed(fit, &views, &guesses) {
+            let cut: Vec<Pose> = views.iter().flat_map(|view| beyond(fit, *view, &guesses)).collect();
+            guesses.extend(cut);
+        }
         let pose = settled(fit, &views, &guesses, TRIED).map_or(first, |(_, pose)| pose);
         fit.poses.insert(time, pose);
     }
@@ -68,4 +78,39 @@ fn led(fit: &Fit<'_>, time: usize, path: &BTreeMap<usize, DVec3>) -> Vec<Pose> {
         led.push(Pose { translation: *to, ..last });
     }
     led
+}
+
+/// Poses in which the border of an image would cut the object as it does its mask, where it stands or, where it does not, as
+/// far away as neighbours lead: what lies beyond the border, or covers all of the mask, is not drawn onto it.
+fn beyond(fit: &Fit<'_>, view: usize, led: &[Pose]) -> Vec<Pose> {
+    let view = &fit.views[view];
+    let (Some(outward), Some(near)) = (view.outward(), led.first()) else { return Vec::new() };
+    let (origin, stands) = (view.camera.centre(), fit.outline.held.contains(&view.time_index));
+    let at = |led: &Pose| {
+        let Some((_, depth)) = view.camera.project(led.translation) else { return Vec::new() };
+        let size = fit.size() * view.camera.focal_px.x / depth;
+        let moved = |share: f64| {
+            let ray = view.camera.ray(view.centroid + share * size * outward);
+            let plane = fit.plane.filter(|_| stands);
+            let depth = plane.and_then(|plane| plane.meet(origin, ray, fit.outline.height)).unwrap_or(depth);
+            Pose { translation: origin + depth * ray, ..*near }
+        };
+        BEYOND.map(moved).to_vec()
+    };
+    led.iter().take(2).flat_map(at).collect()
+}
+
+/// True where the best of some poses leaves most of what views show unexplained, as if the object were not there.
+fn is_missed(fit: &Fit<'_>, views: &[usize], led: &[Pose]) -> bool {
+    let mut shape = fit.shape.copied();
+    let level = fit.trial_level();
+    let mut loss = |pose: &dyn Fn(&ObjectView) -> Pose| -> f64 {
+        views.iter().map(|view| fit.loss_with(&mut shape, *view, level, &pose(&fit.views[*view]))).sum()
+    };
+    let behind = |view: &ObjectView| {
+        let forward = view.camera.camera_from_world.rotation.row(2);
+        Pose { rotation: DQuat::IDENTITY, translation: view.camera.centre() - 10.0 * fit.size() * forward }
+    };
+    let unseen = loss(&behind);
+    led.iter().all(|pose| loss(&|_| *pose) > MISSED * unseen)
 }

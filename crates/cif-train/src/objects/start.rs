@@ -17,7 +17,7 @@ use super::mend::{mend, onto_masks};
 use super::object::{FOLLOWED, Followed, Object, Started};
 use super::path::smooth;
 use super::plane::Plane;
-use super::rotation::shown;
+use super::rotation::{Rivals, shown};
 use super::shape::Pose;
 use super::split::{SplitViews, times_of};
 use super::trials::{self, GAUSSIANS, STEPS};
@@ -114,9 +114,7 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
         (0.6 * decay, 1.5 * decay, level)
     });
     phases.check()?;
-    if let (RotationEvidence::Assumed, Way::Roll(factor), Some(plane), None) =
-        (rotation, way, object.surroundings.plane, fit.rolls)
-    {
+    if let (Way::Roll(factor), Some(plane), None) = (way, object.surroundings.plane, fit.rolls) {
         roll_along(&mut fit, plane, outline.height / factor);
         if let Some(shape) = object.hull(&fit.poses, GAUSSIANS, &mut object.rng()) {
             fit.shape = shape;
@@ -220,7 +218,9 @@ impl<'a> Object<'a> {
             let rotation = |time: usize| DQuat::from_axis_angle(up, angle(time).to_radians());
             path.iter().map(|(t, place)| (*t, Pose { rotation: rotation(*t), translation: *place })).collect()
         };
-        shown(self.views, self.outline.size(), poses, turning(0), RIVALS.map(turning)).is_some()
+        let others = RIVALS.map(turning).into();
+        let rivals = Rivals { unturned: turning(0), rolls: Vec::new(), others, by_outlines: true };
+        shown(self.views, self.outline.size(), poses, rivals)
     }
 
     /// Error of the object bending in one place, on the views that it is fitted to.

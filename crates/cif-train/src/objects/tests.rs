@@ -285,6 +285,39 @@ fn a_pillar_that_turns_is_found_by_its_texture_and_left_at_rest_without() {
     assert!(plain.is_none(), "{}", plain.unwrap().way);
 }
 
+/// Seen by one of several cameras, whose border leaves a sliver of it, where it stands before it is thrown.
+#[test]
+fn what_the_border_nearly_hides_at_first_is_found_where_it_is() {
+    let right = DVec3::new(0.5_f64.cos(), 0.5_f64.sin(), 0.0);
+    let place = |time: usize| {
+        let thrown = (time as f64 - 6.6).clamp(0.0, 4.0);
+        (0.345 - 0.1 * thrown) * right + (0.045 + 0.1 * thrown * (1.0 - thrown / 4.0)) * DVec3::Z
+    };
+    let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(|time| (DQuat::IDENTITY, place(time))).collect();
+    let cameras: Cameras = |_| [0.5, 2.0, 4.0].map(camera).to_vec();
+    let mut views = views(solid(&sphere_places(0.045), patches, 0.006), &truth, cameras);
+    let first = views[0].camera_key;
+    views.retain(|view| view.time_index > 6 || view.camera_key == first);
+    let slivers = views.iter().filter(|view| view.time_index <= 6 && view.cut && view.visible < 0.5);
+    assert_eq!(slivers.count(), 7);
+    with_objects(Some(&FLOOR), &views, |objects| {
+        let pose = |time: usize| Pose { rotation: truth[time].0, translation: truth[time].1 };
+        let poses: BTreeMap<usize, Pose> = (7..TIMES).map(|time| (time, pose(time))).collect();
+        let shape = objects[0].hull(&poses, 150, &mut objects[0].rng()).unwrap();
+        let mut fit = objects[0].fit(poses, shape, objects[0].rng());
+        let known: Vec<usize> = (0..views.len()).filter(|view| views[*view].time_index > 6).collect();
+        fit.steps(&known, 200, |_| (1.0, 0.0, 0));
+        // A path that bends little leads beyond where it stood.
+        let onward = |time: usize| place(7) + (7.0 - time as f64) * (place(7) - place(8));
+        let path = |time: usize| (time, if time < 7 { onward(time) } else { place(time) });
+        grow(&mut fit, &(0..TIMES).map(path).collect());
+        for time in 0..7 {
+            let error = (fit.poses[&time].translation - place(time)).length();
+            assert!(error < 0.012, "{time}: {error} m");
+        }
+    });
+}
+
 #[test]
 fn an_object_that_the_border_cuts_is_followed_from_where_it_is_seen_best() {
     // It comes in from beside the image, and stops as soon as all of it is seen.

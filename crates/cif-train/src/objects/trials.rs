@@ -14,7 +14,7 @@ use super::fit::{Fit, Turns};
 use super::object::{Followed, Object, Started};
 use super::outline::Outline;
 use super::path::smooth;
-use super::rotation::{Course, Revolving, Shown, shown};
+use super::rotation::{Course, Revolving, Rivals, shown};
 use super::shape::Pose;
 use super::split::{SplitViews, times_of};
 use super::texture;
@@ -187,10 +187,13 @@ pub(super) fn best_way<'a>(
     let is_turned = rotation == RotationEvidence::Observed;
     let is_shown = match chosen.is_shown {
         Some(is_shown) if way == Way::Followed => is_shown,
+        // Its rolling is put on afterwards.
+        _ if chosen.fitted != way => contest.shows(way, &contest.paths.poses(way)),
         _ => contest.shows(way, &fit.poses),
     };
     let is_decided = way != Way::Followed || !contest.is_undecided;
-    let rotation = if is_shown && is_decided { rotation } else { RotationEvidence::Assumed };
+    let rotation =
+        if is_shown && is_decided { RotationEvidence::Observed } else { RotationEvidence::Assumed };
     // Light, which stays where it is, argues against rolling: how rigid it is shows where it does not turn, too.
     let error = unturned.filter(|_| way == Way::Lies).map_or(error, |unturned| unturned.min(error));
     let reference = contest.paths.reference;
@@ -324,16 +327,19 @@ impl<'a> Contest<'a> {
 
     /// True where the images show the turns of the poses of a way, and not those of any that differs.
     fn shows(&self, way: Way, poses: &Course) -> bool {
-        let (paths, size) = (&self.paths, self.object.outline.size());
-        let rivals = paths.ways().into_iter().chain(paths.spins()).map(|way| paths.poses(way));
-        // Paths have their turns among the ways.
-        let twisted = if way == Way::Followed { paths.twisted(poses) } else { Vec::new() };
-        let rivals = rivals.chain(twisted);
-        match shown(self.object.views, size, poses, paths.poses(Way::Slide(0)), rivals) {
-            Some(Shown::Turn) => true,
-            Some(Shown::NoTurn) => !paths.may_roll(),
-            None => false,
+        let paths = &self.paths;
+        let (rolls, others): (Vec<Way>, Vec<Way>) =
+            paths.ways().into_iter().chain(paths.spins()).partition(|way| matches!(way, Way::Roll(_)));
+        let courses = |ways: Vec<Way>| ways.into_iter().map(|way| paths.poses(way)).collect::<Vec<_>>();
+        let mut others = courses(others);
+        let by_outlines = way == Way::Followed;
+        if by_outlines {
+            // Paths have their turns among the ways.
+            others.extend(paths.twisted(poses));
         }
+        let unturned = paths.poses(Way::Slide(0));
+        let rivals = Rivals { unturned, rolls: courses(rolls), others, by_outlines };
+        shown(self.object.views, self.object.outline.size(), poses, rivals)
     }
 
     /// Trials of resting, and of moving along the path without a turn: most objects that do not travel rest.

@@ -167,6 +167,15 @@ impl ObjectView {
         distances[((distances.len() - 1) as f64 * share) as usize]
     }
 
+    /// Unit direction in the image from the middle of a mask to where the border cuts it; `None` where it does not.
+    pub(super) fn outward(&self) -> Option<DVec2> {
+        let [width, height] = self.size;
+        let at_border = |[x, y]: &&[u32; 2]| *x == 0 || *y == 0 || *x + 1 == width || *y + 1 == height;
+        let places = self.pixels.iter().filter(at_border);
+        let apart = places.map(|[x, y]| DVec2::new(f64::from(*x) + 0.5, f64::from(*y) + 0.5) - self.centroid);
+        apart.sum::<DVec2>().try_normalize()
+    }
+
     /// The ray through the middle of the mask.
     pub(super) fn ray(&self) -> Ray {
         Ray::through(&self.camera, self.centroid)

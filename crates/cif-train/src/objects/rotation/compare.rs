@@ -12,10 +12,13 @@ const FEWEST_BLOCKS: usize = 5;
 const COMMON: u32 = 15;
 
 /// Standard errors by which every hypothesis beats every other (positive: it is better); NaN where they cannot be
-/// compared. Differences are means over the pixels of a view that both predict, then over views; their standard error is
-/// that of a jackknife over blocks of time.
-pub(super) fn compared(evidence: &Evidence<'_>, fields: &[&[f32]]) -> Vec<Vec<f64>> {
-    let pair = |a: usize, b: usize| standard_errors(&gains(evidence, fields[a], fields[b]));
+/// compared, 0 where they differ by less than `least`. Differences are means over the pixels of a view that both predict, then
+/// over views; their standard error is that of a jackknife over blocks of time.
+pub(super) fn compared(evidence: &Evidence<'_>, fields: &[&[f32]], least: f64) -> Vec<Vec<f64>> {
+    let pair = |a: usize, b: usize| {
+        let gains = gains(evidence, fields[a], fields[b]);
+        if mean(&gains).abs() < least { 0.0 } else { standard_errors(&gains) }
+    };
     let count = fields.len();
     let rows: Vec<Vec<f64>> =
         (0..count).into_par_iter().map(|a| (0..a).map(|b| pair(a, b)).collect()).collect();
@@ -44,6 +47,11 @@ pub(super) fn gains(evidence: &Evidence<'_>, better: &[f32], than: &[f32]) -> Ve
         (count >= COMMON).then(|| (look.view.time_index, sum / f64::from(count)))
     };
     evidence.looks.iter().filter_map(of_view).collect()
+}
+
+/// Mean of differences by time; 0 of none.
+pub(super) fn mean(differences: &[(usize, f64)]) -> f64 {
+    differences.iter().map(|(_, difference)| difference).sum::<f64>() / differences.len().max(1) as f64
 }
 
 /// Mean of differences by time over its standard error, by a jackknife over blocks of time; NaN where these are few.

@@ -24,7 +24,7 @@ mod tests;
 mod turning;
 
 pub(super) use self::hull::Course;
-pub(super) use self::judge::{Shown, shown};
+pub(super) use self::judge::{Rivals, shown};
 pub(super) use self::painted::Turning;
 pub(super) use self::revolved::Revolving;
 pub(super) use self::turning::{Ball, turning};

@@ -8,7 +8,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::super::sequence::{least, unwind};
-use super::compare::{gains, standard_errors};
+use super::compare::{self, gains, standard_errors};
 use super::evidence::{Evidence, Look, Pixel};
 use super::judge::{APART, GRAZING, SIGMAS};
 use super::layered::{LayerCells, LayerSizes, Layers, Observation, layered};
@@ -86,8 +86,7 @@ impl Shown {
     /// Mean gain of turns on pixels that were left out, and by how many standard errors it is one.
     pub(super) fn gain(&self, evidence: &Evidence<'_>, turned: &Turned) -> (f64, f64) {
         let gains = gains(evidence, &self.all.residuals(evidence, turned, true), &self.still);
-        let mean = gains.iter().map(|(_, gain)| gain).sum::<f64>() / gains.len().max(1) as f64;
-        (mean, standard_errors(&gains))
+        (compare::mean(&gains), standard_errors(&gains))
     }
 
     /// Turns of some angles at the times.

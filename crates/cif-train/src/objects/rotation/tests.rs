@@ -7,7 +7,7 @@ use glam::{DQuat, DVec3};
 use super::super::shape::Pose;
 use super::super::testing::{Cameras, TIMES, jumping, moving, patches, rig, solid, sphere_places, views};
 use super::Course;
-use super::judge::{Judge, Shown, Verdict, shown};
+use super::judge::{Judge, Rivals, Verdict, shown};
 use super::revolved::Revolving;
 
 const RADIUS: f64 = 0.06;
@@ -45,7 +45,9 @@ fn judged(
     let mut courses = courses.into_iter();
     let mut judge = Judge::new(&seen, RADIUS, courses.next().unwrap()).unwrap();
     judge.add(courses.collect());
-    judge.verdict().unwrap()
+    let compared = judge.compared();
+    let turns = judge.verdict(&compared.layered).filter(|found| found.is_observed && found.turns);
+    turns.or_else(|| judge.verdict(&compared.shaded)).unwrap()
 }
 
 const TURNS: [f64; 9] = [0.0, 45.0, 90.0, 135.0, 180.0, -45.0, -90.0, -135.0, 225.0];
@@ -96,18 +98,16 @@ fn shading_of_a_plain_ball_that_rolls_is_distinguished_from_a_turn() {
     let whole = (0.3 / RADIUS).to_degrees();
     let of = |color: fn(DVec3) -> [f32; 3], claimed: f64| {
         let seen = views(solid(&sphere_places(RADIUS), color, 0.007), &poses(&rolls(whole)), moving);
-        shown(
-            &seen,
-            RADIUS,
-            &rolls(claimed),
-            rolls(0.0),
-            [0.5, 0.75, 1.0, 1.25].map(|share| rolls(share * whole)),
-        )
+        let (unturned, others) = (rolls(0.0), Vec::new());
+        let rolls: Vec<Course> =
+            [0.5, 0.75, 1.0, 1.25].into_iter().map(|share| course(share * whole, DVec3::Y, place)).collect();
+        let poses = course(claimed, DVec3::Y, place);
+        shown(&seen, RADIUS, &poses, Rivals { unturned, rolls, others, by_outlines: false })
     };
-    assert_eq!(of(patches, whole), Some(Shown::Turn));
-    assert_eq!(of(patches, 0.0), None);
-    assert_ne!(of(|_| [0.7, 0.5, 0.3], whole), Some(Shown::Turn));
-    assert_ne!(of(|_| [0.7, 0.5, 0.3], 0.0), Some(Shown::Turn));
+    assert!(of(patches, whole));
+    assert!(!of(patches, 0.0));
+    assert!(!of(|_| [0.7, 0.5, 0.3], whole));
+    assert!(!of(|_| [0.7, 0.5, 0.3], 0.0));
 }
 
 /// Size of the Gaussians of a cylinder.
@@ -186,4 +186,24 @@ fn what_lies_is_a_solid_of_revolution_about_no_upright_axis() {
     let revolving = Revolving::new(seen.iter(), 0.08, &course, DVec3::Z, None).unwrap();
     let [lying, upright] = [-DVec3::X, DVec3::Z].map(|axis| revolving.covered(axis));
     assert!(upright > 0.85 && lying < 0.7, "{lying}, {upright}");
+}
+
+/// True where a box that stands and is turned by so many degrees on its way is judged to turn as claimed.
+fn box_is_shown(truth: f64, claimed: f64, color: fn(DVec3) -> [f32; 3], by_outlines: bool) -> bool {
+    let place = |time: usize| DVec3::new(0.3 * share(time) - 0.15, 0.0, 0.05);
+    let of = |degrees: f64| course(degrees, DVec3::Z, place);
+    let half = DVec3::new(0.035, 0.07, 0.05);
+    let places: Vec<DVec3> = sphere_places(1.0).iter().map(|p| half * (*p / p.abs().max_element())).collect();
+    let seen = views(solid(&places, color, 0.005), &poses(&of(truth)), moving);
+    let others = (-6..=6).filter(|k| *k != 0).map(|k| of(30.0 * f64::from(k))).collect();
+    let rivals = Rivals { unturned: of(0.0), rolls: Vec::new(), others, by_outlines };
+    shown(&seen, half.max_element(), &of(claimed), rivals)
+}
+
+#[test]
+fn outlines_show_how_a_plain_box_turns_where_poses_follow_them() {
+    let plain = |_| [0.6, 0.6, 0.6];
+    assert!(box_is_shown(130.0, 130.0, plain, true));
+    assert!(!box_is_shown(130.0, 40.0, plain, true));
+    assert!(!box_is_shown(130.0, 130.0, plain, false), "light alone");
 }
