@@ -42,6 +42,12 @@ impl Ray {
         Self::new(camera.centre(), camera.ray(pixel).normalize())
     }
 
+    /// The ray where only how far points are from it along a unit vector counts.
+    #[must_use]
+    pub fn only_along(self, axis: DVec3) -> Self {
+        Self { across: DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z), ..self }
+    }
+
     /// Projection onto the plane across it.
     #[must_use]
     pub fn across(&self) -> DMat3 {

@@ -62,7 +62,8 @@ impl MaskRow {
             camera: *camera,
             centroid_px: self.centroid(),
             area_px: f64::from(self.pixels),
-            cut: self.is_cut(),
+            cut: [(0, camera.width), (1, camera.height)]
+                .map(|(axis, size)| self.low[axis] == 0 || self.high[axis] + 1 >= size),
             contact_depth: None,
         })
     }

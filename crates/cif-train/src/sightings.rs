@@ -67,7 +67,7 @@ fn is_whole(observation: &Observation, others: &[Observation]) -> bool {
     let mut areas: Vec<f64> = others.iter().map(|other| other.area_px).collect();
     areas.sort_by(f64::total_cmp);
     let Some(median) = areas.get(areas.len() / 2) else { return false };
-    !observation.cut && observation.area_px >= FEWEST_PIXELS.max(WHOLE * median)
+    !observation.is_cut() && observation.area_px >= FEWEST_PIXELS.max(WHOLE * median)
 }
 
 #[cfg(test)]
@@ -88,7 +88,7 @@ mod tests {
                     camera: synthetic::generate(&synthetic::SyntheticConfig::default()).camera,
                     centroid_px: DVec2::splat(10.0),
                     area_px: f64::from(areas[time]),
-                    cut: false,
+                    cut: [false; 2],
                     contact_depth: None,
                 };
                 let seen = (areas[time] > 0).then_some((1, observation));

@@ -25,16 +25,42 @@ pub struct Observation {
     pub centroid_px: DVec2,
     /// Pixels of the mask.
     pub area_px: f64,
-    /// True when the mask touches the border of the image, so that its area says nothing.
-    pub cut: bool,
+    /// True along the columns, and the rows, of the image where the mask touches its border, so that nothing shows how far
+    /// the object reaches beyond it.
+    pub cut: [bool; 2],
     /// Camera depth of what is seen just outside the mask where that is nearest, metres.
     pub contact_depth: Option<f64>,
 }
 
 impl Observation {
+    /// True when the border cuts the mask, so that its area says nothing.
+    #[must_use]
+    pub fn is_cut(&self) -> bool {
+        self.cut != [false, false]
+    }
+
     /// The ray through the centre of the mask.
     fn ray(&self) -> Ray {
         Ray::through(&self.camera, self.centroid_px)
+    }
+
+    /// The same as far as the border leaves the centre in place; `None` where it does not.
+    fn placed_ray(&self) -> Option<Ray> {
+        let seen = (self.centroid_px - self.camera.principal_px) / self.camera.focal_px;
+        let axis = match self.cut {
+            [false, false] => return Some(self.ray()),
+            [true, true] => return None,
+            [true, false] => DVec3::new(0.0, 1.0, -seen.y),
+            [false, true] => DVec3::new(1.0, 0.0, -seen.x),
+        };
+        Some(self.ray().only_along((self.camera.camera_from_world.rotation.transpose() * axis).normalize()))
+    }
+
+    /// Distance of a point from the centre of the mask, pixels, as far as the border leaves that in place.
+    fn miss_px(&self, point: DVec3) -> f64 {
+        let left = self.cut.map(|cut| if cut { 0.0 } else { 1.0 });
+        let apart = |(pixel, _): (DVec2, f64)| (DVec2::from(left) * (pixel - self.centroid_px)).length();
+        self.camera.project(point).map_or(f64::INFINITY, apart)
     }
 
     /// Radius of a disc as large as the mask, pixels.
@@ -74,20 +100,16 @@ const LATE: usize = 8;
 const FEWEST: usize = 5;
 
 /// True when an instance travels: no fixed point explains the directions that its mask is seen in. The median
-/// distance of that point from the mask's centre is compared with the mask's radius.
+/// distance of that point from the mask's centre is compared with the mask's radius. Along the way out of the image the
+/// centre of a mask that the border cuts says nothing.
 #[must_use]
 pub fn travels(observations: &[Observation]) -> bool {
-    if observations.len() < FEWEST {
+    let point = fixed_point(observations);
+    let placed = observations.iter().filter(|o| o.cut != [true, true]);
+    let mut misses: Vec<f64> = placed.map(|o| o.miss_px(point) / o.radius_px()).collect();
+    if misses.len() < FEWEST {
         return false;
     }
-    let point = fixed_point(observations);
-    let mut misses: Vec<f64> = observations
-        .iter()
-        .map(|o| match o.camera.project(point) {
-            Some((pixel, _)) => (pixel - o.centroid_px).length() / o.radius_px(),
-            None => f64::INFINITY,
-        })
-        .collect();
     misses.sort_by(f64::total_cmp);
     misses[misses.len() / 2] > TRAVEL
 }
@@ -97,9 +119,15 @@ const TRAVEL: f64 = 0.3;
 
 /// The point nearest to all rays through the masks' centres.
 fn fixed_point(observations: &[Observation]) -> DVec3 {
-    let rays = observations.iter().map(|o| (o.ray(), 1.0));
-    nearest_point(rays, PARALLEL).unwrap_or_else(|| observations[0].camera.centre())
+    // What the border cuts away moves centres, but they show about where it is.
+    let about = observations.iter().map(|o| (o.ray(), ABOUT));
+    let rays = observations.iter().filter_map(|o| Some((o.placed_ray()?, 1.0))).chain(about);
+    let origin = observations.first().map_or(DVec3::ZERO, |o| o.camera.centre());
+    nearest_point(rays, PARALLEL).unwrap_or(origin)
 }
+
+/// Weight of rays through the centres of masks whether or not the border cuts them.
+const ABOUT: f64 = 1e-3;
 
 /// Determinant below which rays count as parallel.
 const PARALLEL: f64 = 1e-12;
@@ -137,7 +165,7 @@ pub fn fit(observations: &[Observation]) -> Option<Track> {
         values.sort_by(f64::total_cmp);
         values.get(values.len() / 2).copied()
     };
-    let whole = || observations.iter().filter(|o| !o.cut);
+    let whole = || observations.iter().filter(|o| !o.is_cut());
     // Taken from contacts, the size cannot shrink together with the path.
     let by_contacts = median(whole().filter_map(|o| Some(o.contact_depth? / unit_depth(o))).collect());
     let mut size = by_contacts;
@@ -174,7 +202,7 @@ pub fn fit(observations: &[Observation]) -> Option<Track> {
             } else if guess.is_some() {
                 depth_says(distance, GUESS_SIGMA);
             }
-            if let (Some(size), false) = (size, o.cut) {
+            if let (Some(size), false) = (size, o.is_cut()) {
                 depth_says(size * unit_depth(o), DEPTH_SIGMA);
             }
         }

@@ -112,7 +112,7 @@ mod tests {
                         camera: camera(stated),
                         centroid_px,
                         area_px: 300.0,
-                        cut: false,
+                        cut: [false; 2],
                         contact_depth: None,
                     }
                 };

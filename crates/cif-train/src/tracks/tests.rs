@@ -35,7 +35,7 @@ fn observe(steps: usize, centre: impl Fn(f64) -> DVec3, contacts: bool) -> Vec<O
                 area_px: std::f64::consts::PI
                     * (RADIUS * 300.0 / depth).powi(2)
                     * (1.0 + 0.02 * (k as f64).sin()),
-                cut: false,
+                cut: [false; 2],
                 contact_depth: contacts.then_some(below * (1.0 + 0.01 * (k as f64 * 0.8).cos())),
             }
         })
@@ -52,6 +52,35 @@ fn error(track: &Track, steps: usize, truth: impl Fn(f64) -> DVec3) -> f64 {
     let off: Vec<DVec3> = times.iter().map(|time| track.at(&times, *time) - truth(*time)).collect();
     let mean = off.iter().sum::<DVec3>() / steps as f64;
     off.iter().map(|off| (*off - mean).length()).fold(0.0, f64::max)
+}
+
+/// A ball as the border of an image shows it that leaves what is above a row.
+fn cut_below(whole: &Observation, row: f64) -> Observation {
+    let (side, radius) = (60, whole.radius_px());
+    let offset =
+        |k: usize| DVec2::new((k % side) as f64, (k / side) as f64) / (0.5 * (side - 1) as f64) - 1.0;
+    let disc: Vec<DVec2> = (0..side * side).map(offset).filter(|offset| offset.length() < 1.0).collect();
+    let places = disc.iter().map(|offset| whole.centroid_px + radius * *offset);
+    let left: Vec<DVec2> = places.filter(|pixel| pixel.y < row).collect();
+    let centroid_px = left.iter().sum::<DVec2>() / left.len() as f64;
+    let area_px = whole.area_px * left.len() as f64 / disc.len() as f64;
+    Observation { centroid_px, area_px, cut: [false, true], ..*whole }
+}
+
+#[test]
+fn what_the_border_cuts_does_not_travel_because_its_middle_moves() {
+    // It stands still while more and more of it comes into the image, and goes again.
+    let still = DVec3::new(0.2, 0.1, RADIUS);
+    let seen = observe(40, |_| still, true);
+    let row = |(k, o): (usize, &Observation)| o.centroid_px.y - 0.8 * o.radius_px() * (k as f64 * 0.3).cos();
+    let cut: Vec<Observation> = seen.iter().enumerate().map(|at| cut_below(at.1, row(at))).collect();
+    assert!(!travels(&cut));
+    let mut whole = cut.clone();
+    whole.iter_mut().for_each(|o| o.cut = [false; 2]);
+    assert!(travels(&whole), "in masks that the border does not cut, it would");
+    let rolls = observe(40, rolling, true);
+    let cut: Vec<Observation> = rolls.iter().map(|o| cut_below(o, o.centroid_px.y)).collect();
+    assert!(travels(&cut));
 }
 
 #[test]
@@ -104,7 +133,7 @@ fn without_contacts_many_directions_at_a_time_suffice() {
                 camera,
                 centroid_px,
                 area_px,
-                cut: false,
+                cut: [false; 2],
                 contact_depth: None,
             });
         }

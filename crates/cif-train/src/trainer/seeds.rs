@@ -84,7 +84,9 @@ impl Trainer {
     pub(super) fn seed(&mut self, label: u16, track: Track, seen: &[Observation]) -> Result<(), TrainError> {
         // The canonical pose is the one that shows most of it.
         let Some(best) = seen.iter().max_by(|a, b| {
-            (!a.cut, a.area_px).partial_cmp(&(!b.cut, b.area_px)).unwrap_or(std::cmp::Ordering::Equal)
+            (!a.is_cut(), a.area_px)
+                .partial_cmp(&(!b.is_cut(), b.area_px))
+                .unwrap_or(std::cmp::Ordering::Equal)
         }) else {
             return Ok(());
         };
