@@ -50,6 +50,19 @@ fn errors(found: &BTreeMap<usize, (DQuat, DVec3)>, truth: &[(DQuat, DVec3)]) -> 
     (turn, shift / found.len() as f64)
 }
 
+/// An object in its true poses at some times, made of so many Gaussians.
+fn in_true_poses<'a>(
+    object: &Object<'a>,
+    truth: &[(DQuat, DVec3)],
+    times: impl IntoIterator<Item = usize>,
+    gaussians: usize,
+) -> Fit<'a> {
+    let pose = |time: usize| (time, Pose { rotation: truth[time].0, translation: truth[time].1 });
+    let poses = times.into_iter().map(pose).collect();
+    let shape = object.hull(&poses, gaussians, &mut object.rng()).unwrap();
+    object.fit(poses, shape, object.rng())
+}
+
 /// Places on the sides of a box, by half its extents.
 fn sides(half: DVec3) -> Vec<DVec3> {
     let mut rng = stream(0, Purpose::Objects, 9);
@@ -177,10 +190,7 @@ fn what_one_camera_sees_a_part_of_is_found_where_it_is() {
         (view.cut, view.visible) = (true, 0.05);
     }
     with_objects(Some(&FLOOR), &views, |objects| {
-        let pose = |time: usize| Pose { rotation: truth[time].0, translation: truth[time].1 };
-        let poses: BTreeMap<usize, Pose> = (12..TIMES).map(|time| (time, pose(time))).collect();
-        let shape = objects[0].hull(&poses, 150, &mut objects[0].rng()).unwrap();
-        let mut fit = objects[0].fit(poses, shape, objects[0].rng());
+        let mut fit = in_true_poses(&objects[0], &truth, 12..TIMES, 150);
         let known: Vec<usize> = (0..views.len()).filter(|view| views[*view].time_index > 11).collect();
         fit.steps(&known, 200, |_| (1.0, 0.0, 0));
         grow(&mut fit, &objects[0].outline.path);
@@ -301,10 +311,7 @@ fn what_the_border_nearly_hides_at_first_is_found_where_it_is() {
     let slivers = views.iter().filter(|view| view.time_index <= 6 && view.cut && view.visible < 0.5);
     assert_eq!(slivers.count(), 7);
     with_objects(Some(&FLOOR), &views, |objects| {
-        let pose = |time: usize| Pose { rotation: truth[time].0, translation: truth[time].1 };
-        let poses: BTreeMap<usize, Pose> = (7..TIMES).map(|time| (time, pose(time))).collect();
-        let shape = objects[0].hull(&poses, 150, &mut objects[0].rng()).unwrap();
-        let mut fit = objects[0].fit(poses, shape, objects[0].rng());
+        let mut fit = in_true_poses(&objects[0], &truth, 7..TIMES, 150);
         let known: Vec<usize> = (0..views.len()).filter(|view| views[*view].time_index > 6).collect();
         fit.steps(&known, 200, |_| (1.0, 0.0, 0));
         // A path that bends little leads beyond where it stood.
@@ -431,11 +438,8 @@ fn times_that_hardly_show_it_are_off_the_support_between_times_that_are() {
     let (views, truth) = lifted_and_tilted();
     let hidden = [3, 8, 14, 15, 16];
     with_objects(Some(&FLOOR), &views, |objects| {
-        let pose = |time: usize| Pose { rotation: truth[time].0, translation: truth[time].1 };
-        let seen = (0..TIMES).filter(|time| !hidden.contains(time));
-        let poses: BTreeMap<usize, Pose> = seen.map(|time| (time, pose(time))).collect();
-        let shape = objects[0].hull(&poses, 150, &mut objects[0].rng()).unwrap();
-        let mut fit = objects[0].fit(poses, shape, objects[0].rng());
+        let mut fit =
+            in_true_poses(&objects[0], &truth, (0..TIMES).filter(|time| !hidden.contains(time)), 150);
         fit.air = (9..21).filter(|time| !hidden.contains(time)).collect();
         grow(&mut fit, &(0..TIMES).map(|time| (time, truth[time].1)).collect());
         assert_eq!(fit.poses.len(), TIMES);
@@ -478,10 +482,7 @@ fn mended(
         (0..TIMES).map(|k| (DQuat::from_rotation_z(0.04 * k as f64), place(k))).collect();
     let views = views(solid, &truth, moving);
     let poses = with_objects(Some(&FLOOR), &views, |objects| {
-        let pose = |time: usize| Pose { rotation: truth[time].0, translation: truth[time].1 };
-        let poses: BTreeMap<usize, Pose> = (0..TIMES).map(|time| (time, pose(time))).collect();
-        let shape = objects[0].hull(&poses, 300, &mut objects[0].rng()).unwrap();
-        let mut fit = objects[0].fit(poses, shape, objects[0].rng());
+        let mut fit = in_true_poses(&objects[0], &truth, 0..TIMES, 300);
         for time in jumped {
             let pose = fit.poses.get_mut(&time).unwrap();
             *pose = Pose { rotation: turn * pose.rotation, ..*pose };
@@ -509,10 +510,7 @@ fn poses_aside_of_their_masks_move_onto_them() {
     for cameras in [moving as Cameras, rig] {
         let views = views(solid(&box_places(), patches, 0.006), &truth, cameras);
         let errors = with_objects(Some(&FLOOR), &views, |objects| {
-            let pose = |time: usize| Pose { rotation: truth[time].0, translation: truth[time].1 };
-            let poses: BTreeMap<usize, Pose> = (0..TIMES).map(|time| (time, pose(time))).collect();
-            let shape = objects[0].hull(&poses, 300, &mut objects[0].rng()).unwrap();
-            let mut fit = objects[0].fit(poses, shape, objects[0].rng());
+            let mut fit = in_true_poses(&objects[0], &truth, 0..TIMES, 300);
             let all: Vec<usize> = (0..views.len()).collect();
             fit.steps(&all, 600, |_| (1.0, 0.0, 0));
             // As a smooth path passes by where something bounces.
@@ -577,11 +575,9 @@ fn turns_at_times_that_hide_it_go_the_way_of_those_around_them() {
     // The shortest turn across the gap is the other way round; between 3 and 5 the poses there show it.
     views.retain(|view| view.time_index != 4 && !(8..22).contains(&view.time_index));
     with_objects(Some(&FLOOR), &views, |objects| {
-        let pose = |time: usize| Pose { rotation: truth[time].0, translation: truth[time].1 };
         let gaps = |rolls: Option<f64>| {
-            let poses = views.iter().map(|view| (view.time_index, pose(view.time_index))).collect();
-            let shape = objects[0].hull(&poses, 300, &mut objects[0].rng()).unwrap();
-            let mut fit = objects[0].fit(poses, shape, objects[0].rng());
+            let times = views.iter().map(|view| view.time_index);
+            let mut fit = in_true_poses(&objects[0], &truth, times, 300);
             fit.rolls = rolls;
             fit.fill_long_turns();
             let error =
