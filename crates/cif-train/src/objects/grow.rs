@@ -46,7 +46,7 @@ pub(super) fn grow(fit: &mut Fit<'_>, path: &BTreeMap<usize, DVec3>) {
         let shows_place =
             |view: &usize| fit.views[*view].time_index == time && fit.views[*view].shows_place();
         let views: Vec<usize> = (0..fit.views.len()).filter(shows_place).collect();
-        if is_missed(fit, &views, &guesses) {
+        if views.iter().any(|view| fit.views[*view].cut) && is_missed(fit, &views, &guesses) {
             let cut: Vec<Pose> = views.iter().flat_map(|view| beyond(fit, *view, &guesses)).collect();
             guesses.extend(cut);
         }

@@ -77,9 +77,10 @@ pub(in super::super) fn shown(views: &[ObjectView], size: f64, poses: &Course, r
     let Some(mut judge) = Judge::new(views, size, unturned) else { return false };
     let first_roll = 2 + others.len();
     judge.add(std::iter::once(poses.clone()).chain(others).chain(rolls).collect());
-    let is_of_poses = |found: &Verdict| judge.angle(found.best, 1) <= APART;
     let compared = judge.compared();
-    let seen = |compared: &[Vec<f64>]| judge.verdict(compared).filter(|found| found.is_observed);
+    let angles = &compared.angles;
+    let is_of_poses = |found: &Verdict| angles[found.best][1] <= APART;
+    let seen = |compared: &[Vec<f64>]| judge.verdict(compared, angles).filter(|found| found.is_observed);
     if let Some(turn) = seen(&compared.layered).filter(|found| found.turns) {
         return is_of_poses(&turn);
     }
@@ -87,7 +88,7 @@ pub(in super::super) fn shown(views: &[ObjectView], size: f64, poses: &Course, r
         return true;
     }
     let contradicted = |stays: &Verdict, from: usize| {
-        let rivals = (from..judge.courses.len()).filter(|rival| judge.angle(stays.best, *rival) > APART);
+        let rivals = (from..judge.courses.len()).filter(|rival| angles[stays.best][*rival] > APART);
         rivals.map(|rival| compared.missed[stays.best][rival]).all(|sigmas| sigmas > SIGMAS)
     };
     // To layers places that are a little off look like turns, and whatever is plain like none.
@@ -114,6 +115,8 @@ pub(super) struct Compared {
     missed: Vec<Vec<f64>>,
     /// The larger one of layers and outlines; 0 where these contradict each other.
     both: Vec<Vec<f64>>,
+    /// Largest angles between them, radians.
+    pub(super) angles: Vec<Vec<f64>>,
 }
 
 /// Hypotheses about one object, and how well each explains its pixels.
@@ -171,17 +174,16 @@ impl<'a> Judge<'a> {
         let missed = compared(|r| &r.missed, LEFT_OUT);
         let of_row = |(a, b): (&Vec<f64>, &Vec<f64>)| a.iter().zip(b).map(|(a, b)| both(*a, *b)).collect();
         let both = layered.iter().zip(&missed).map(of_row).collect();
-        Compared { layered, shaded, missed, both }
+        let count = self.courses.len();
+        let angles = (0..count).map(|a| (0..count).map(|b| self.angle(a, b)).collect()).collect();
+        Compared { layered, shaded, missed, both, angles }
     }
 
-    /// The finding by a comparison; `None` where no hypothesis can be compared with another.
-    pub(super) fn verdict(&self, compared: &[Vec<f64>]) -> Option<Verdict> {
-        let count = self.courses.len();
-        let angles: Vec<Vec<f64>> =
-            (0..count).map(|a| (0..count).map(|b| self.angle(a, b)).collect()).collect();
+    /// The finding by a comparison of hypotheses at angles; `None` where none can be compared with another.
+    pub(super) fn verdict(&self, compared: &[Vec<f64>], angles: &[Vec<f64>]) -> Option<Verdict> {
         let largest = self.residuals.iter().map(|residuals| residuals.volume).fold(0.0, f64::max);
         let is_out: Vec<bool> = self.residuals.iter().map(|r| r.volume < LEAST_VOLUME * largest).collect();
-        verdict(compared, &angles, &is_out)
+        verdict(compared, angles, &is_out)
     }
 
     /// Largest angle between two hypotheses, radians: both are taken relative to the middle of the times at which they have

@@ -46,8 +46,9 @@ fn judged(
     let mut judge = Judge::new(&seen, RADIUS, courses.next().unwrap()).unwrap();
     judge.add(courses.collect());
     let compared = judge.compared();
-    let turns = judge.verdict(&compared.layered).filter(|found| found.is_observed && found.turns);
-    turns.or_else(|| judge.verdict(&compared.shaded)).unwrap()
+    let turns =
+        judge.verdict(&compared.layered, &compared.angles).filter(|found| found.is_observed && found.turns);
+    turns.or_else(|| judge.verdict(&compared.shaded, &compared.angles)).unwrap()
 }
 
 const TURNS: [f64; 9] = [0.0, 45.0, 90.0, 135.0, 180.0, -45.0, -90.0, -135.0, 225.0];
