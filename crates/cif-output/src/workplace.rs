@@ -86,9 +86,10 @@ mod tests {
         fs::write(living.path().join("frame.png"), "x").unwrap();
         let dead = Workplace::inside(place.path(), "cif-a-").unwrap();
         fs::write(dead.path().join("frame.png"), "x").unwrap();
-        // As when it is killed: the lock goes, the folder stays.
-        let Workplace { removed, _lock } = dead;
-        drop(_lock);
+        // As when it is killed: the lock goes, the folder stays. To close the file is not enough, as a process that
+        // another test has just begun may share it for a moment.
+        let Workplace { removed, _lock: lock } = dead;
+        lock.unlock().unwrap();
         std::mem::forget(removed);
         fs::create_dir(place.path().join("cif-a-mine")).unwrap();
         let other = Workplace::inside(place.path(), "cif-b-").unwrap();
