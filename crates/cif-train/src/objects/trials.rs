@@ -78,9 +78,9 @@ const OFF_GAIN: f64 = 0.85;
 /// turn.
 const TEXTURE_GAIN: f64 = 1.3;
 
-/// Share of the pixels of an object that a solid of revolution about an axis across its path covers, and how much more than
-/// one about the upright axis, from which it lies, and rolls. Bars and a can that roll: 0.83 and 0.31 more and above,
-/// others at most 0.12 more.
+/// Share of the pixels of an object that a solid of revolution about an axis covers, from which it is one, and how much more one
+/// across its path covers than one about the upright axis, from which it lies, and rolls. Bars and a can that roll: 0.83 and
+/// 0.31 more and above, others at most 0.12 more.
 const LIES: [f64; 2] = [0.8, 0.2];
 
 /// Largest error of rolling, relative to that of sliding, at which rolling is preferred: of most objects, and of round
@@ -296,14 +296,14 @@ impl<'a> Contest<'a> {
     /// True where an object deforms, or opens: it stays in place, and looks otherwise in every turn.
     fn deforms(&self, way: Way, error: f64, bent: Option<f64>, simple: &Simple) -> bool {
         let most = match simple.at_rest {
-            _ if matches!(way, Way::Spin(_)) => MOST_IN_PLACE,
+            _ if matches!(way, Way::Spin(_) | Way::Turns) => MOST_IN_PLACE,
             Some(at_rest) if simple.stays && simple.is_unexplained => EXPLAINED * at_rest,
             _ => f64::INFINITY,
         };
         // Of thin things the outline, which is never exact, is most of what is seen: they are solid where bending explains
         // no more.
         let may_be_solid = !self.object.outline.is_surrounded
-            && !matches!(way, Way::Spin(_))
+            && !matches!(way, Way::Spin(_) | Way::Turns)
             && bent.is_some_and(|bent| bent >= BENDS_NO_BETTER);
         error > most && !self.object.is_declared && !may_be_solid
     }
@@ -320,7 +320,7 @@ impl<'a> Contest<'a> {
             (RotationEvidence::Assumed, _) => (Turns::Given, None),
             (_, Way::Roll(factor)) => (Turns::Free, Some(outline.height / factor)),
             // Light, which stays where it is, would pull it back.
-            (_, Way::Textured | Way::Lies) => (Turns::Given, None),
+            (_, Way::Textured | Way::Lies | Way::Turns) => (Turns::Given, None),
             _ => (Turns::Free, None),
         };
     }
@@ -369,12 +369,27 @@ impl<'a> Contest<'a> {
         if !stays && let Some(lying) = self.lying(simple, &seen) {
             return Some((Way::Lies, lying));
         }
-        let mut turns = texture::turns(seen.iter().copied(), &paths.along, outline, paths.up);
-        // What stays in place neither rolls nor flies.
-        if turns.is_none() && paths.shifts() {
-            turns = ball::turns(&seen, &paths.along, outline, &paths.rolls());
+        if let Some(turns) = texture::turns(seen.iter().copied(), &paths.along, outline, paths.up) {
+            return Some((Way::Textured, paths.along_with(&turns)));
         }
-        Some((Way::Textured, paths.along_with(&turns?)))
+        // What stays in place neither rolls nor flies.
+        if !paths.shifts() {
+            return Some((Way::Turns, self.turning(&seen)?));
+        }
+        let turns = ball::turns(&seen, &paths.along, outline, &paths.rolls())?;
+        Some((Way::Textured, paths.along_with(&turns)))
+    }
+
+    /// Poses of turning in place about the upright axis, where the object is a solid of revolution about it, and its paint
+    /// shows turns.
+    fn turning(&self, seen: &[&ObjectView]) -> Option<BTreeMap<usize, Pose>> {
+        let (paths, size) = (&self.paths, self.object.outline.size());
+        if is_round(self.object.outline) || self.object.surroundings.plane.is_none() {
+            return None;
+        }
+        let rest = paths.poses(Way::Rest);
+        let revolving = Revolving::new(seen.iter().copied(), size, &rest, paths.up, None)?;
+        if revolving.covered(paths.up) > LIES[0] { revolving.turned(paths.up) } else { None }
     }
 
     /// Poses of rolling without slip about an axis across the path, where the object is a solid of revolution about it.
@@ -488,7 +503,7 @@ impl<'a> Contest<'a> {
             }
             let mut fit = self.object.fit(poses, shape, rng);
             (fit.turns, fit.rolls) = match way {
-                Way::Rest | Way::Lies => (Turns::Given, None),
+                Way::Rest | Way::Lies | Way::Turns => (Turns::Given, None),
                 Way::Slide(_) | Way::Spin(_) => (Turns::Upright, None),
                 Way::Roll(factor) => (Turns::Free, Some(self.paths.outline.height / factor)),
                 Way::Followed | Way::Textured => (Turns::Free, None),

@@ -53,6 +53,8 @@ pub(super) enum Way {
     Textured,
     /// Along the path, rolling about an axis that lies across it.
     Lies,
+    /// In place, turning about the upright axis as its paint shows it.
+    Turns,
 }
 
 impl Way {
@@ -66,6 +68,7 @@ impl Way {
             Self::Followed => "followed from time to time".to_owned(),
             Self::Textured => "turns as its texture tells".to_owned(),
             Self::Lies => "rolls on its side".to_owned(),
+            Self::Turns => "turns in place, as its texture shows".to_owned(),
         }
     }
 
@@ -95,7 +98,7 @@ pub(super) struct Paths<'a> {
     pub(super) followed: Option<BTreeMap<usize, Pose>>,
     /// Times at which it may be off its support in these.
     pub(super) off: Vec<usize>,
-    /// Poses with turns that its texture shows, or of rolling on its side.
+    /// Poses with turns that its texture shows, on its way or in place, or of rolling on its side.
     pub(super) turned: Option<BTreeMap<usize, Pose>>,
 }
 
@@ -225,7 +228,7 @@ impl Paths<'_> {
                 let back = rotations[origin].inverse();
                 rotations.into_iter().map(|rotation| rotation * back).collect()
             }
-            Way::Followed | Way::Textured | Way::Lies => {
+            Way::Followed | Way::Textured | Way::Lies | Way::Turns => {
                 let found = if way == Way::Followed { &self.followed } else { &self.turned };
                 return found
                     .iter()

@@ -5,8 +5,9 @@
 //! | `evidence` | which pixels judge |
 //! | `hull` | the shape of an object under a hypothesis, and what pixels see of it |
 //! | `judge` | which rotation they show, and whether they do |
-//! | `turning`, `revolved` | how a ball turns that stays in place, and a solid of revolution that rolls |
-//! | `painted` | which turns of a surface its paint shows |
+//! | `turning`, `revolved` | how a ball turns that stays in place, and a solid of revolution that rolls or turns |
+//! | `painted` | which turns of a surface explain its paint |
+//! | `shown` | whether they are what the pictures show |
 //! | `layered`, `shaded` | how well paint and light explain pixels left out |
 //! | `folds`, `compare` | which pixels are left out, and by how many standard errors one hypothesis is better |
 
@@ -19,6 +20,7 @@ mod layered;
 mod painted;
 mod revolved;
 mod shaded;
+mod shown;
 #[cfg(test)]
 mod tests;
 mod turning;

@@ -1,5 +1,4 @@
-//! Paint on a surface about an axis: which turns of all times explain the pixels that show it. They are what the pictures
-//! show where light that stays and paint that turns explain pixels that were left out better than what stays alone does.
+//! Paint on a surface about an axis: which turns of all times explain the pixels that show it.
 
 use std::collections::BTreeMap;
 use std::f64::consts::{PI, TAU};
@@ -8,13 +7,9 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::super::sequence::{least, unwind};
-use super::compare::{self, gains, standard_errors};
 use super::evidence::{Evidence, Look, Pixel};
-use super::judge::{APART, GRAZING, SIGMAS};
+use super::judge::GRAZING;
 use super::layered::{LayerCells, LayerSizes, Layers, Observation, layered};
-
-/// Pixels of a view that are looked at.
-const PIXELS: usize = 400;
 
 /// Places of the sequence from which turns are followed.
 const SEEDS: [f64; 5] = [1.0 / 6.0, 1.0 / 3.0, 0.5, 2.0 / 3.0, 5.0 / 6.0];
@@ -60,58 +55,8 @@ pub(in super::super) struct Turning {
     pub(in super::super) angles: BTreeMap<usize, f64>,
 }
 
-/// Places of a surface that pixels show, and how well they are explained where nothing turns.
-pub(super) struct Shown {
-    all: Seen,
-    /// Places that a few pixels of each view show.
-    pub(super) few: Seen,
-    still: Vec<f32>,
-}
-
-impl Shown {
-    /// Places that pixels show, from the middle of the axis, in the frame in which the surface turns, seen at a cosine;
-    /// `None` where there is too little.
-    pub(super) fn of(
-        evidence: &Evidence<'_>,
-        cells: Cells,
-        place: impl Fn(&Look<'_>, &Pixel) -> Option<(DVec3, f64)>,
-    ) -> Option<Self> {
-        let all = Seen::of(evidence, cells, place);
-        // Light of each camera by itself is known from fewer pixels than paint that all of them show.
-        let still = all.residuals(evidence, &all.still(), all.cameras > 1);
-        let few = all.few(PIXELS, &still)?;
-        Some(Self { all, few, still })
-    }
-
-    /// Mean gain of turns on pixels that were left out, and by how many standard errors it is one.
-    pub(super) fn gain(&self, evidence: &Evidence<'_>, turned: &Turned) -> (f64, f64) {
-        let gains = gains(evidence, &self.all.residuals(evidence, turned, true), &self.still);
-        (compare::mean(&gains), standard_errors(&gains))
-    }
-
-    /// Turns of some angles at the times.
-    pub(super) fn turned(&self, axis: DVec3, angle: impl FnMut(&usize) -> f64) -> Turned {
-        Turned { axis, angles: self.all.times.iter().map(angle).collect(), cost: 0.0 }
-    }
-
-    /// Turns that were found as angles by time.
-    pub(super) fn turning(&self, found: &Turned) -> Turning {
-        let angles = self.all.times.iter().copied().zip(found.angles.iter().copied()).collect();
-        Turning { axis: found.axis, angles }
-    }
-
-    /// Mean residuals of pixels left out, with turns and by light alone; `None` where they do not show the turns, by more
-    /// than 30 degrees.
-    pub(super) fn errors(&self, evidence: &Evidence<'_>, found: &Turned) -> Option<[f64; 2]> {
-        let residuals = self.all.residuals(evidence, found, true);
-        let is_shown =
-            standard_errors(&gains(evidence, &residuals, &self.still)) > SIGMAS && found.reach() > APART;
-        if is_shown { Some([mean(&residuals)?, self.few.error]) } else { None }
-    }
-}
-
 /// Mean of what is predicted.
-fn mean(residuals: &[f32]) -> Option<f64> {
+pub(super) fn mean(residuals: &[f32]) -> Option<f64> {
     let known = || residuals.iter().filter(|residual| !residual.is_nan());
     let count = known().count();
     (count > 0).then(|| known().map(|residual| f64::from(*residual)).sum::<f64>() / count as f64)
@@ -163,11 +108,11 @@ impl Cells {
 
 /// A place of the surface that a pixel shows.
 #[derive(Clone)]
-struct Spot {
-    pixel: usize,
+pub(super) struct Spot {
+    pub(super) pixel: usize,
     look: usize,
     /// From the middle of the axis, in the frame in which the surface turns.
-    place: DVec3,
+    pub(super) place: DVec3,
     /// Camera whose highlights these are.
     camera: usize,
     value: DVec3,
@@ -177,15 +122,15 @@ struct Spot {
 #[derive(Clone)]
 pub(super) struct Seen {
     cells: Cells,
-    cameras: usize,
-    spots: Vec<Spot>,
+    pub(super) cameras: usize,
+    pub(super) spots: Vec<Spot>,
     /// Ranges of the spots of views, the places of their times, and these times.
     ranges: Vec<std::ops::Range<usize>>,
     time_of: Vec<usize>,
-    times: Vec<usize>,
+    pub(super) times: Vec<usize>,
     /// Error of every spot with light alone, which is what paint that no other time shows predicts, and their mean.
     alone: Vec<f64>,
-    error: f64,
+    pub(super) error: f64,
 }
 
 /// Turns about an axis at all times, and what they cost.
@@ -198,7 +143,7 @@ pub(super) struct Turned {
 
 impl Turned {
     /// Difference of the largest and the least angle.
-    fn reach(&self) -> f64 {
+    pub(super) fn reach(&self) -> f64 {
         let ends = |(low, high): (f64, f64), angle: &f64| (low.min(*angle), high.max(*angle));
         let (low, high) = self.angles.iter().fold((f64::INFINITY, f64::NEG_INFINITY), ends);
         high - low
@@ -207,7 +152,7 @@ impl Turned {
 
 impl Seen {
     /// Places that pixels show, seen at a cosine.
-    fn of(
+    pub(super) fn of(
         evidence: &Evidence<'_>,
         cells: Cells,
         place: impl Fn(&Look<'_>, &Pixel) -> Option<(DVec3, f64)>,
@@ -238,7 +183,7 @@ impl Seen {
 
     /// The same of at most so many pixels of each view, with the residuals that light alone leaves of all; `None` where it
     /// predicts none.
-    fn few(&self, most: usize, still: &[f32]) -> Option<Self> {
+    pub(super) fn few(&self, most: usize, still: &[f32]) -> Option<Self> {
         let error = mean(still)?;
         let mut few = Self { error, spots: Vec::new(), ranges: Vec::new(), ..self.clone() };
         for range in &self.ranges {
@@ -253,8 +198,36 @@ impl Seen {
         Some(few)
     }
 
+    /// Some of the places.
+    pub(super) fn only(&self, is_kept: impl Fn(&Spot) -> bool) -> Self {
+        let mut some = Self { spots: Vec::new(), ranges: Vec::new(), alone: Vec::new(), ..self.clone() };
+        for range in &self.ranges {
+            let start = some.spots.len();
+            for k in range.clone().filter(|k| is_kept(&self.spots[*k])) {
+                some.spots.push(self.spots[k].clone());
+                some.alone.push(self.alone[k]);
+            }
+            some.ranges.push(start..some.spots.len());
+        }
+        some
+    }
+
+    /// Angle about an axis of the middle of what is seen, by time: it follows the camera.
+    pub(super) fn sides(&self, axis: DVec3) -> Vec<f64> {
+        let (first, second) = axis.any_orthonormal_pair();
+        let mut sums = vec![(0.0, 0.0); self.times.len()];
+        for spot in &self.spots {
+            let sum = &mut sums[self.time_of[spot.look]];
+            sum.0 += spot.place.dot(first);
+            sum.1 += spot.place.dot(second);
+        }
+        let mut angles: Vec<f64> = sums.into_iter().map(|(x, y): (f64, f64)| y.atan2(x)).collect();
+        unwind(angles.iter_mut());
+        angles
+    }
+
     /// No turns at any time.
-    fn still(&self) -> Turned {
+    pub(super) fn still(&self) -> Turned {
         Turned { axis: DVec3::Z, angles: vec![0.0; self.times.len()], cost: 0.0 }
     }
 
@@ -285,7 +258,7 @@ impl Seen {
     }
 
     /// Residuals of all pixels that are left out, by the layered model.
-    fn residuals(&self, evidence: &Evidence<'_>, turned: &Turned, turns: bool) -> Vec<f32> {
+    pub(super) fn residuals(&self, evidence: &Evidence<'_>, turned: &Turned, turns: bool) -> Vec<f32> {
         let painted = self.painted(turned.axis);
         let mut paint = vec![None; evidence.len()];
         let mut light = vec![None; evidence.len()];

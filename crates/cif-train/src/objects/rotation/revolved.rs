@@ -1,5 +1,5 @@
-//! How a solid of revolution that lies turns about its axis, which its outline does not show: a bar or a can that rolls. Its
-//! surface is the largest such solid inside the outlines.
+//! How a solid of revolution turns about its axis, which its outline does not show: a bar or a can that rolls, a bottle that
+//! turns where it stands. Its surface is the largest such solid inside the outlines.
 
 use glam::{DQuat, DVec3};
 
@@ -8,7 +8,8 @@ use super::super::view::ObjectView;
 use super::evidence::{Evidence, Look, Pixel};
 use super::hull::{Contact, Course, Hull, voxel};
 use super::judge::SIGMAS;
-use super::painted::{Cells, Shown, Turning};
+use super::painted::{Cells, Turning};
+use super::shown::Shown;
 
 /// Times that the hull is carved again with the turns that were found: views of all sides show what few of one do not.
 const CARVED: usize = 3;
@@ -79,6 +80,17 @@ impl<'a> Revolving<'a> {
         }
         // Its places are those of the course, which all outlines show.
         Some(found.about(self.course, DVec3::ZERO))
+    }
+
+    /// The course, turning about an axis of this direction as the paint shows it; `None` where it shows no turn of more than
+    /// 30 degrees.
+    pub(in super::super) fn turned(&self, axis: DVec3) -> Option<Course> {
+        let solid = self.solid(axis, None)?;
+        let shown = solid.shown(None)?;
+        let painted = shown.few.painted(axis);
+        let found = shown.few.finely(painted.further(painted.roughly()));
+        shown.errors(&self.evidence, &found)?;
+        shown.turns(&self.evidence, &found).then(|| shown.turning(&found).about(self.course, solid.middle))
     }
 
     /// The largest solid of revolution about an axis of this direction, on a support.

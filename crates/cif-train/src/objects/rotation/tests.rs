@@ -5,10 +5,15 @@ use std::f64::consts::PI;
 use glam::{DQuat, DVec3};
 
 use super::super::shape::Pose;
-use super::super::testing::{Cameras, TIMES, jumping, moving, patches, rig, solid, sphere_places, views};
-use super::Course;
+use super::super::testing::{
+    Cameras, TIMES, camera, jumping, moving, patches, rig, solid, sphere_places, views,
+};
+use super::evidence::{Evidence, Look, Pixel};
 use super::judge::{Judge, Rivals, Verdict, shown};
+use super::painted::Cells;
 use super::revolved::Revolving;
+use super::shown::Shown;
+use super::{Ball, Course};
 
 const RADIUS: f64 = 0.06;
 
@@ -71,6 +76,27 @@ fn what_stays_is_not_seen_to_turn() {
         let found = judged(0.0, &TURNS, DVec3::Z, stays, patches, cameras);
         assert_eq!(found.best, 0, "{found:?}");
     }
+}
+
+/// Turns about the upright axis of a ball that is modelled with some radius: are they shown, and are they its own.
+fn shown_turns(degrees: f64, radius: f64, cameras: Cameras) -> [bool; 2] {
+    let ball = solid(&sphere_places(RADIUS), patches, 0.007);
+    let seen = views(ball, &poses(&course(degrees, DVec3::Z, stays)), cameras);
+    let evidence = Evidence::of(seen.iter()).unwrap();
+    let ball = Ball { centre: stays(0), radius };
+    let place =
+        |look: &Look<'_>, pixel: &Pixel| ball.outward(look.view.camera.centre(), pixel.ray.normalize());
+    let shown = Shown::of(&evidence, Cells::OfBall(24.0), place).unwrap();
+    let painted = shown.few.painted(DVec3::Z);
+    let found = shown.few.finely(painted.further(painted.roughly()));
+    [shown.errors(&evidence, &found).is_some(), shown.turns(&evidence, &found)]
+}
+
+#[test]
+fn paint_that_slides_over_a_surface_at_another_depth_is_no_turn() {
+    let around = |time: usize| vec![camera(3.0 * share(time))];
+    assert_eq!(shown_turns(0.0, 1.5 * RADIUS, around), [true, false]);
+    assert_eq!(shown_turns(-200.0, RADIUS, moving), [true, true]);
 }
 
 #[test]

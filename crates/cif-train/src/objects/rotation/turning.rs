@@ -7,7 +7,8 @@ use rayon::prelude::*;
 
 use super::super::view::ObjectView;
 use super::evidence::{Evidence, Look, Pixel};
-use super::painted::{Cells, Shown, Turned, Turning, hemisphere};
+use super::painted::{Cells, Turned, Turning, hemisphere};
+use super::shown::Shown;
 
 /// Axes that are tried of a ball, about 23 degrees apart, and those that are tried further.
 const AXES: usize = 40;
