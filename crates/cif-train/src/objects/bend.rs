@@ -8,21 +8,30 @@ use super::fit::{Fit, GREY};
 use super::shape::{Adam, Shape};
 use super::split::SplitViews;
 
-/// Captured times from one knot of the field to the next.
-const KNOT: usize = 3;
-
 /// Functions of the place: 1, its coordinates, and products of two of these.
 const TERMS: usize = 10;
 
-/// Steps, the share of the first rates that the last have, and first rates of the coefficients, of the size, and of the
-/// Gaussians.
-const STEPS: usize = 900;
+/// Share of the first rates that the last have, and first rate of the Gaussians.
 const LAST: f64 = 0.05;
-const RATE: f64 = 0.002;
 const SHAPE_RATE: f64 = 0.5;
+
+/// Work that a fit of the field may take.
+#[derive(Clone, Copy)]
+pub(super) struct Effort {
+    /// Captured times from one knot of the field to the next.
+    knot: usize,
+    steps: usize,
+    /// First rate of the coefficients, of the size.
+    rate: f64,
+}
+
+/// Enough to see that a rigid body does not explain an object, and to explain what deforms as well as it can be.
+pub(super) const ROUGHLY: Effort = Effort { knot: 3, steps: 900, rate: 0.002 };
+pub(super) const WELL: Effort = Effort { knot: 2, steps: 1500, rate: 0.008 };
 
 /// Shifts that are quadratic in the place and linear in time between knots.
 struct Bend {
+    effort: Effort,
     /// Time of the first knot.
     first: usize,
     size: f64,
@@ -33,11 +42,12 @@ struct Bend {
 
 impl Bend {
     /// No shifts, at the times of the poses of a fit.
-    fn none(fit: &Fit<'_>) -> Self {
+    fn none(fit: &Fit<'_>, effort: Effort) -> Self {
         let first = fit.poses.first_key_value().map_or(0, |(time, _)| *time);
         let last = fit.poses.last_key_value().map_or(0, |(time, _)| *time);
-        let knots = (last - first) / KNOT + 2;
+        let knots = (last - first) / effort.knot + 2;
         Self {
+            effort,
             first,
             size: fit.size(),
             knots: vec![[DVec3::ZERO; TERMS]; knots],
@@ -52,8 +62,8 @@ impl Bend {
 
     /// Knots around a time, with their weights.
     fn knots_around(&self, time: usize) -> [(usize, f64); 2] {
-        let (before, rest) = ((time - self.first) / KNOT, (time - self.first) % KNOT);
-        let share = rest as f64 / KNOT as f64;
+        let (since, knot) = (time - self.first, self.effort.knot);
+        let (before, share) = (since / knot, (since % knot) as f64 / knot as f64);
         [(before, 1.0 - share), (before + 1, share)]
     }
 
@@ -67,8 +77,9 @@ impl Bend {
         places.iter().map(|place| *place + shift(place)).collect()
     }
 
-    /// A step against the gradients by the shifted places of a time.
-    fn step(&mut self, time: usize, places: &[DVec3], gradients: &[DVec3], rate: f64) {
+    /// A step against the gradients by the shifted places of a time, at a share of the first rate.
+    fn step(&mut self, time: usize, places: &[DVec3], gradients: &[DVec3], share: f64) {
+        let rate = share * self.effort.rate * self.size;
         let mut sums = [DVec3::ZERO; TERMS];
         for (place, gradient) in places.iter().zip(gradients) {
             for (sum, term) in sums.iter_mut().zip(self.terms(*place)) {
@@ -78,7 +89,7 @@ impl Bend {
         for (knot, weight) in self.knots_around(time) {
             let values = sums.iter().flat_map(|sum| (weight * *sum).to_array());
             let coefficients = &mut self.knots[knot];
-            self.moments[knot].step(values, rate * self.size, |k, step| coefficients[k / 3][k % 3] -= step);
+            self.moments[knot].step(values, rate, |k, step| coefficients[k / 3][k % 3] -= step);
         }
     }
 }
@@ -103,19 +114,19 @@ fn loss(
     value
 }
 
-/// Mean loss over the views that judge, after a fit to others in the poses that there are.
-fn refitted(fit: &Fit<'_>, mut bend: Option<Bend>, views: &SplitViews, level: usize) -> f64 {
+/// Mean loss over the views that judge, after so many steps on others in the poses that there are.
+fn refitted(fit: &Fit<'_>, mut bend: Option<Bend>, steps: usize, views: &SplitViews, level: usize) -> f64 {
     let (mut shape, mut rng, mut order) = (fit.shape.copied(), fit.rng.clone(), views.train.clone());
-    for step in 0..if order.is_empty() { 0 } else { STEPS } {
+    for step in 0..if order.is_empty() { 0 } else { steps } {
         let place = step % order.len();
         if place == 0 {
             order.shuffle(&mut rng);
         }
-        let (view, rate) = (order[place], LAST.powf(step as f64 / STEPS as f64));
+        let (view, rate) = (order[place], LAST.powf(step as f64 / steps as f64));
         let places = shape.centres();
         loss(fit, &mut shape, bend.as_ref(), view, level, true);
         if let Some(bend) = &mut bend {
-            bend.step(fit.views[view].time_index, &places, &shape.centre_gradients(), RATE * rate);
+            bend.step(fit.views[view].time_index, &places, &shape.centre_gradients(), rate);
         }
         shape.step(SHAPE_RATE * rate);
     }
@@ -127,12 +138,13 @@ fn refitted(fit: &Fit<'_>, mut bend: Option<Bend>, views: &SplitViews, level: us
 }
 
 /// Error of an object that may bend, on views that were left out.
-pub(super) fn bent(fit: &Fit<'_>, views: &SplitViews, level: usize) -> f64 {
-    refitted(fit, Some(Bend::none(fit)), views, level)
+pub(super) fn bent(fit: &Fit<'_>, views: &SplitViews, level: usize, effort: Effort) -> f64 {
+    refitted(fit, Some(Bend::none(fit, effort)), effort.steps, views, level)
 }
 
 /// The same, of that of one that may not.
 pub(super) fn gain(fit: &Fit<'_>, views: &SplitViews, level: usize) -> f64 {
-    let (rigid, bent) = rayon::join(|| refitted(fit, None, views, level), || bent(fit, views, level));
+    let rigid = || refitted(fit, None, ROUGHLY.steps, views, level);
+    let (rigid, bent) = rayon::join(rigid, || bent(fit, views, level, ROUGHLY));
     bent / rigid.max(1e-12)
 }

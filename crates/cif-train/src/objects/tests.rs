@@ -14,6 +14,7 @@ use super::grow::grow;
 use super::mend::{mend, onto_masks};
 use super::object::Object;
 use super::outlines;
+use super::parts;
 use super::plane::{self, Plane};
 use super::shape::Pose;
 use super::split::SplitViews;
@@ -657,7 +658,7 @@ fn what_folds_on_its_way_is_explained_by_bending_and_a_solid_is_not() {
 }
 
 #[test]
-fn what_is_squashed_where_it_stands_is_given_no_poses() {
+fn what_is_squashed_where_it_stands_is_given_neither_poses_nor_a_part() {
     const LAYERS: usize = 10;
     let cube: Vec<DVec3> =
         sides(DVec3::splat(0.05)).into_iter().map(|place| place + DVec3::new(0.0, 0.0, 0.05)).collect();
@@ -673,6 +674,10 @@ fn what_is_squashed_where_it_stands_is_given_no_poses() {
         (0..TIMES).map(pose).collect()
     };
     let poses: Vec<_> = (0..LAYERS).map(poses).collect();
-    let views = views_of_groups(solid(&cube, patches, 0.007), group_of, &poses, moving);
-    assert!(fit_on(Some(&FLOOR), &views).is_none());
+    for cameras in [moving as Cameras, rig as Cameras] {
+        let views = views_of_groups(solid(&cube, patches, 0.007), group_of.clone(), &poses, cameras);
+        assert!(fit_on(Some(&FLOOR), &views).is_none());
+        let part = with_objects(Some(&FLOOR), &views, |objects| parts::find(objects[0]).unwrap());
+        assert!(part.is_none(), "{}", part.unwrap().told());
+    }
 }

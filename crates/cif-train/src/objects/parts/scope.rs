@@ -5,6 +5,8 @@ use std::collections::BTreeMap;
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
+use super::super::bend;
+use super::super::fit::Turns;
 use super::super::object::Object;
 use super::super::shape::{Pose, Shape};
 use super::super::split::{SplitViews, times_of};
@@ -22,6 +24,9 @@ const ACROSS: f64 = 1.1;
 const ROWS: usize = 7;
 const ROW: usize = 4;
 const FEWEST_IN_ROW: usize = 4;
+
+/// Gaussians of an object that bends.
+const BENT: usize = 500;
 
 /// Shared facts of a search.
 pub(super) struct Search<'a> {
@@ -92,6 +97,15 @@ impl<'a> Search<'a> {
         let mut body = self.body(self.hull(&poses, None, gaussians)?, None);
         body.steps(views, steps, level, |share| (if share < 0.5 { 1.0 } else { 0.5 }, 0.0));
         Some(body)
+    }
+
+    /// Error of the object where it bends on its base, on the views that were left out.
+    pub(super) fn bent(&self) -> Option<f64> {
+        let shape = self.hull(self.base, None, BENT)?;
+        let mut fit = self.object.fit(self.base.clone(), shape, self.object.rng());
+        fit.turns = Turns::Given;
+        fit.stays = true;
+        Some(bend::bent(&fit, &self.views, 0, bend::WELL))
     }
 
     /// The object without parts as it looks in the row of times that are most alike, with the views of these.
