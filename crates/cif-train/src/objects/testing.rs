@@ -174,6 +174,18 @@ pub(super) fn patches(p: DVec3) -> [f32; 3] {
     })
 }
 
+/// Places on the faces of a box.
+pub(super) fn faces(low: DVec3, high: DVec3, count: usize, seed: u64) -> Vec<DVec3> {
+    let mut rng = stream(0, Purpose::Objects, seed);
+    (0..count)
+        .map(|k| {
+            let mut p = low + (high - low) * DVec3::from(std::array::from_fn(|_| rng.random::<f64>()));
+            p[k % 3] = if (k / 3) % 2 == 0 { low[k % 3] } else { high[k % 3] };
+            p
+        })
+        .collect()
+}
+
 pub(super) fn sphere_places(radius: f64) -> Vec<DVec3> {
     let mut rng = stream(0, Purpose::Objects, 10);
     (0..1200)

@@ -20,7 +20,7 @@ use super::shape::Pose;
 use super::split::SplitViews;
 use super::start::{Fitted, fit_object};
 use super::testing::{
-    Cameras, FLOOR, TIMES, camera, jumping, moving, patches, rig, solid, sphere_places, views,
+    Cameras, FLOOR, TIMES, camera, faces, jumping, moving, patches, rig, solid, sphere_places, views,
     views_in_masks, views_of_groups, with_objects,
 };
 use super::view::ObjectView;
@@ -66,14 +66,7 @@ fn in_true_poses<'a>(
 
 /// Places on the sides of a box, by half its extents.
 fn sides(half: DVec3) -> Vec<DVec3> {
-    let mut rng = stream(0, Purpose::Objects, 9);
-    (0..1500)
-        .map(|k| {
-            let mut p = DVec3::from(std::array::from_fn(|_| 2.0 * rng.random::<f64>() - 1.0));
-            p[k % 3] = if (k / 3) % 2 == 0 { 1.0 } else { -1.0 };
-            half * p
-        })
-        .collect()
+    faces(-half, half, 1500, 9)
 }
 
 fn box_places() -> Vec<DVec3> {
