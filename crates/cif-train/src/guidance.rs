@@ -12,7 +12,7 @@ use crate::losses::displacement::{Pose, Pull, displacement_loss, rotations};
 use crate::tracks::Track;
 
 /// Distance from the path beyond which the pull no longer grows, relative to the extent.
-const PATH_REACH: f64 = 0.02;
+pub(crate) const PATH_REACH: f64 = 0.02;
 
 /// The same for the distance from the canonical place of what does not travel.
 const PLACE_REACH: f64 = 0.002;

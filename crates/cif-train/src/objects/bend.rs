@@ -1,8 +1,10 @@
 //! An object that bends, held against one that does not: a smooth field over its frame, which changes with time, shifts
 //! its Gaussians. What deforms is explained far better by it, what is merely seen badly is not.
 
+use cif_field::Gaussians;
 use glam::DVec3;
 use rand::seq::SliceRandom;
+use serde::{Deserialize, Serialize};
 
 use super::fit::{Fit, GREY};
 use super::shape::{Adam, Shape};
@@ -17,7 +19,7 @@ const SHAPE_RATE: f64 = 0.5;
 
 /// Work that a fit of the field may take.
 #[derive(Clone, Copy)]
-pub(super) struct Effort {
+struct Effort {
     /// Captured times from one knot of the field to the next.
     knot: usize,
     steps: usize,
@@ -26,48 +28,37 @@ pub(super) struct Effort {
 }
 
 /// Enough to see that a rigid body does not explain an object, and to explain what deforms as well as it can be.
-pub(super) const ROUGHLY: Effort = Effort { knot: 3, steps: 900, rate: 0.002 };
-pub(super) const WELL: Effort = Effort { knot: 2, steps: 1500, rate: 0.008 };
+const ROUGHLY: Effort = Effort { knot: 3, steps: 900, rate: 0.002 };
+const WELL: Effort = Effort { knot: 2, steps: 1500, rate: 0.008 };
 
 /// Shifts that are quadratic in the place and linear in time between knots.
-struct Bend {
-    effort: Effort,
-    /// Time of the first knot.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(crate) struct Shifts {
+    /// Time of the first knot, and captured times from one to the next.
     first: usize,
+    knot: usize,
+    /// Size of the object, metres.
     size: f64,
     /// Coefficients by knot, metres.
     knots: Vec<[DVec3; TERMS]>,
-    moments: Vec<Adam>,
 }
 
-impl Bend {
-    /// No shifts, at the times of the poses of a fit.
-    fn none(fit: &Fit<'_>, effort: Effort) -> Self {
-        let first = fit.poses.first_key_value().map_or(0, |(time, _)| *time);
-        let last = fit.poses.last_key_value().map_or(0, |(time, _)| *time);
-        let knots = (last - first) / effort.knot + 2;
-        Self {
-            effort,
-            first,
-            size: fit.size(),
-            knots: vec![[DVec3::ZERO; TERMS]; knots],
-            moments: vec![Adam::new(3 * TERMS); knots],
-        }
-    }
-
+impl Shifts {
     fn terms(&self, place: DVec3) -> [f64; TERMS] {
         let DVec3 { x, y, z } = place / self.size;
         [1.0, x, y, z, x * x, y * y, z * z, x * y, y * z, z * x]
     }
 
-    /// Knots around a time, with their weights.
+    /// Knots around a time, with their weights; times before the first and after the last are as these.
     fn knots_around(&self, time: usize) -> [(usize, f64); 2] {
-        let (since, knot) = (time - self.first, self.effort.knot);
-        let (before, share) = (since / knot, (since % knot) as f64 / knot as f64);
+        let last = self.first + self.knot * (self.knots.len() - 1) - 1;
+        let since = time.clamp(self.first, last) - self.first;
+        let (before, share) = (since / self.knot, (since % self.knot) as f64 / self.knot as f64);
         [(before, 1.0 - share), (before + 1, share)]
     }
 
-    fn shifted(&self, time: usize, places: &[DVec3]) -> Vec<DVec3> {
+    /// Places of the object, in its frame, with their shifts at a time.
+    pub(crate) fn shifted(&self, time: usize, places: &[DVec3]) -> Vec<DVec3> {
         let near = self.knots_around(time);
         let coefficients: [DVec3; TERMS] =
             std::array::from_fn(|k| near.iter().map(|(knot, weight)| *weight * self.knots[*knot][k]).sum());
@@ -77,18 +68,44 @@ impl Bend {
         places.iter().map(|place| *place + shift(place)).collect()
     }
 
+    /// True where numbers that were saved are shifts.
+    pub(crate) fn are_sound(&self) -> bool {
+        let are_finite = self.knots.iter().flatten().all(|coefficient| coefficient.is_finite());
+        self.knots.len() > 1 && self.knot > 0 && self.size > 0.0 && are_finite
+    }
+}
+
+/// Shifts that are fitted.
+struct Bend {
+    shifts: Shifts,
+    moments: Vec<Adam>,
+    /// First rate of the coefficients, metres.
+    rate: f64,
+}
+
+impl Bend {
+    /// No shifts, at the times of the poses of a fit.
+    fn none(fit: &Fit<'_>, effort: Effort) -> Self {
+        let first = fit.poses.first_key_value().map_or(0, |(time, _)| *time);
+        let last = fit.poses.last_key_value().map_or(0, |(time, _)| *time);
+        let (knot, size) = (effort.knot, fit.size());
+        let count = (last - first) / knot + 2;
+        let shifts = Shifts { first, knot, size, knots: vec![[DVec3::ZERO; TERMS]; count] };
+        Self { shifts, moments: vec![Adam::new(3 * TERMS); count], rate: effort.rate * size }
+    }
+
     /// A step against the gradients by the shifted places of a time, at a share of the first rate.
     fn step(&mut self, time: usize, places: &[DVec3], gradients: &[DVec3], share: f64) {
-        let rate = share * self.effort.rate * self.size;
+        let rate = share * self.rate;
         let mut sums = [DVec3::ZERO; TERMS];
         for (place, gradient) in places.iter().zip(gradients) {
-            for (sum, term) in sums.iter_mut().zip(self.terms(*place)) {
+            for (sum, term) in sums.iter_mut().zip(self.shifts.terms(*place)) {
                 *sum += term * *gradient;
             }
         }
-        for (knot, weight) in self.knots_around(time) {
+        for (knot, weight) in self.shifts.knots_around(time) {
             let values = sums.iter().flat_map(|sum| (weight * *sum).to_array());
-            let coefficients = &mut self.knots[knot];
+            let coefficients = &mut self.shifts.knots[knot];
             self.moments[knot].step(values, rate, |k, step| coefficients[k / 3][k % 3] -= step);
         }
     }
@@ -107,15 +124,21 @@ fn loss(
     let Some(pose) = fit.poses.get(&view.time_index) else { return 0.0 };
     let places = shape.centres();
     if let Some(bend) = bend {
-        shape.set_centres(&bend.shifted(view.time_index, &places));
+        shape.set_centres(&bend.shifts.shifted(view.time_index, &places));
     }
     let value = shape.loss(&view.crops[level], pose, GREY, 1.0, differentiates).value;
     shape.set_centres(&places);
     value
 }
 
-/// Mean loss over the views that judge, after so many steps on others in the poses that there are.
-fn refitted(fit: &Fit<'_>, mut bend: Option<Bend>, steps: usize, views: &SplitViews, level: usize) -> f64 {
+/// Gaussians and shifts after so many steps in the poses that there are, with the mean loss over the views that judge.
+fn refitted(
+    fit: &Fit<'_>,
+    mut bend: Option<Bend>,
+    steps: usize,
+    views: &SplitViews,
+    level: usize,
+) -> (Shape, Option<Bend>, f64) {
     let (mut shape, mut rng, mut order) = (fit.shape.copied(), fit.rng.clone(), views.train.clone());
     for step in 0..if order.is_empty() { 0 } else { steps } {
         let place = step % order.len();
@@ -134,17 +157,25 @@ fn refitted(fit: &Fit<'_>, mut bend: Option<Bend>, steps: usize, views: &SplitVi
     let mut judge = |view: &usize| weight(view) * loss(fit, &mut shape, bend.as_ref(), *view, level, false);
     let judged = views.judged();
     let sum: f64 = judged.iter().map(&mut judge).sum();
-    sum / judged.iter().map(weight).sum::<f64>().max(1e-12)
+    let error = sum / judged.iter().map(weight).sum::<f64>().max(1e-12);
+    (shape, bend, error)
 }
 
 /// Error of an object that may bend, on views that were left out.
-pub(super) fn bent(fit: &Fit<'_>, views: &SplitViews, level: usize, effort: Effort) -> f64 {
-    refitted(fit, Some(Bend::none(fit, effort)), effort.steps, views, level)
+pub(super) fn bent(fit: &Fit<'_>, views: &SplitViews, level: usize) -> f64 {
+    refitted(fit, Some(Bend::none(fit, ROUGHLY)), ROUGHLY.steps, views, level).2
 }
 
 /// The same, of that of one that may not.
 pub(super) fn gain(fit: &Fit<'_>, views: &SplitViews, level: usize) -> f64 {
-    let rigid = || refitted(fit, None, ROUGHLY.steps, views, level);
-    let (rigid, bent) = rayon::join(rigid, || bent(fit, views, level, ROUGHLY));
+    let rigid = || refitted(fit, None, ROUGHLY.steps, views, level).2;
+    let (rigid, bent) = rayon::join(rigid, || bent(fit, views, level));
     bent / rigid.max(1e-12)
+}
+
+/// An object that bends in one place, explained as well as it can be: its Gaussians and shifts, in its frame, with the
+/// error on views that were left out.
+pub(super) fn bending(fit: &Fit<'_>, views: &SplitViews) -> Option<(Gaussians, Shifts, f64)> {
+    let (shape, bend, error) = refitted(fit, Some(Bend::none(fit, WELL)), WELL.steps, views, 0);
+    Some((shape.gaussians().clone(), bend?.shifts, error))
 }

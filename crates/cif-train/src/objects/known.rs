@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::Found;
-use super::parts::Jointed;
+use super::parts::{Bending, InPlace, Jointed};
 use super::start::Fitted;
 
 /// Findings about objects, by label (dense index + 1). Gaussians are saved as tensors, everything else as JSON.
@@ -20,6 +20,9 @@ pub(crate) struct KnownObjects {
     pub(crate) rigid: BTreeMap<u16, Found>,
     /// Their parts on joints; `None` where they have none.
     pub(crate) parts: BTreeMap<u16, Option<Jointed>>,
+    /// Those that deform where they stand.
+    #[serde(default)]
+    pub(crate) bending: BTreeMap<u16, Bending>,
     /// True once all objects were tried for motion; a state of version 1 does not say.
     #[serde(default)]
     pub(crate) is_searched: bool,
@@ -46,9 +49,14 @@ impl KnownObjects {
         self.parts.get(&label)?.as_ref()
     }
 
-    /// True where an object has poses, as a whole or of a part.
-    pub(crate) fn has_poses(&self, label: u16) -> bool {
-        self.moving(label).is_some() || self.jointed(label).is_some()
+    /// True where the motion of an object is known: as a whole, of a part, or how it deforms.
+    pub(crate) fn is_found(&self, label: u16) -> bool {
+        self.moving(label).is_some() || self.is_found_in_place(label)
+    }
+
+    /// The same of what stays where it is.
+    pub(crate) fn is_found_in_place(&self, label: u16) -> bool {
+        self.jointed(label).is_some() || self.bending.contains_key(&label)
     }
 
     /// Keeps that an object stands still but for a part that turns in place.
@@ -57,12 +65,17 @@ impl KnownObjects {
         self.parts.insert(label, Some(part));
     }
 
-    /// Keeps the part of an object on a joint that was looked for, instead of a motion as a whole that explains no more.
-    pub(crate) fn insert_part(&mut self, label: u16, part: Option<Jointed>) {
-        match (part, self.moving(label)) {
-            (Some(part), Some(whole)) if part.errors[0] <= whole.error => self.insert_turning(label, part),
-            (Some(_), Some(_)) => drop(self.parts.insert(label, None)),
-            (part, _) => drop(self.parts.insert(label, part)),
+    /// Keeps what was looked for of an object that stays in place, instead of a motion as a whole that explains no more.
+    pub(crate) fn insert_in_place(&mut self, label: u16, found: Option<InPlace>) {
+        let whole = self.moving(label).map_or(f64::INFINITY, |whole| whole.error);
+        match found {
+            Some(InPlace::Jointed(part)) if part.errors[0] <= whole => self.insert_turning(label, part),
+            Some(InPlace::Bends(bending)) if bending.error <= whole => {
+                self.rigid.insert(label, Found::Nothing);
+                self.parts.insert(label, None);
+                self.bending.insert(label, bending);
+            }
+            _ => drop(self.parts.insert(label, None)),
         }
     }
 
@@ -84,6 +97,9 @@ impl KnownObjects {
                 sets.push((format!("{TENSORS}{label}.base"), base));
                 sets.push((format!("{TENSORS}{label}.part"), part));
             }
+        }
+        for (label, found) in &mut self.bending {
+            sets.push((format!("{TENSORS}{label}.bending"), &mut found.gaussians));
         }
         sets
     }
@@ -110,7 +126,7 @@ impl KnownObjects {
         times: usize,
     ) -> Option<Self> {
         let mut known: Self = serde_json::from_value(json).ok()?;
-        let labels = known.rigid.keys().chain(known.parts.keys());
+        let labels = known.rigid.keys().chain(known.parts.keys()).chain(known.bending.keys());
         let are_labels = labels.copied().all(|label| (1..=instances).contains(&usize::from(label)));
         let of_rigid = known.rigid.values().filter_map(|found| match found {
             Found::Moves(fitted) => Some(
@@ -125,7 +141,8 @@ impl KnownObjects {
             let last = found.values.last_key_value();
             last.is_some_and(|(time, _)| *time < times)
         });
-        if !are_labels || !of_rigid.chain(of_parts).all(|fits| fits) {
+        let of_bending = known.bending.values().map(|found| found.shifts.are_sound());
+        if !are_labels || !of_rigid.chain(of_parts).chain(of_bending).all(|fits| fits) {
             return None;
         }
         for (name, gaussians) in known.sets() {
@@ -183,14 +200,14 @@ mod tests {
         for (of_part, of_whole, is_kept) in [(0.10, 0.11, true), (0.11, 0.11, true), (0.12, 0.11, false)] {
             let mut known = KnownObjects::default();
             known.rigid.insert(1, whole(of_whole));
-            known.insert_part(1, Some(part(of_part)));
+            known.insert_in_place(1, Some(InPlace::Jointed(part(of_part))));
             assert_eq!(known.jointed(1).is_some(), is_kept, "{of_part}, {of_whole}");
             assert_eq!(known.moving(1).is_none(), is_kept, "{of_part}, {of_whole}");
             // It was looked for, whatever is kept.
             assert!(known.parts.contains_key(&1));
         }
         let mut known = KnownObjects::default();
-        known.insert_part(1, Some(part(0.2)));
+        known.insert_in_place(1, Some(InPlace::Jointed(part(0.2))));
         assert!(known.jointed(1).is_some());
     }
 }

@@ -70,7 +70,7 @@ pub(crate) use self::known::KnownObjects;
 use self::object::Object;
 pub(crate) use self::object::Surroundings;
 pub(crate) use self::order::Order;
-pub(crate) use self::parts::Jointed;
+pub(crate) use self::parts::{Bending, InPlace, Jointed};
 pub(crate) use self::plane::Plane;
 pub(crate) use self::start::Fitted;
 pub(crate) use self::trials::BENDS_NO_BETTER;
@@ -161,8 +161,8 @@ pub(crate) fn fit(
     Ok(fitted.map_or(Found::Nothing, |fitted| Found::Moves(Box::new(fitted))))
 }
 
-/// Finds the part of an object at rest (a label: dense index + 1) which turns on a hinge or slides; `None` where it
-/// has none, or the masks do not show enough.
+/// Finds the part of an object at rest (a label: dense index + 1) which turns on a hinge or slides, or how it deforms; `None`
+/// where it does neither, or the masks do not show enough.
 ///
 /// # Errors
 /// As of [`fit`].
@@ -171,7 +171,7 @@ pub(crate) fn find_part(
     dataset: &Dataset,
     frames: &FrameStore,
     surroundings: Surroundings<'_>,
-) -> Result<Option<Jointed>, TrainError> {
+) -> Result<Option<InPlace>, TrainError> {
     let views = views_of(label, dataset, frames, surroundings)?;
     let outlines = outlines::outlines(&views, surroundings.plane, surroundings.times);
     // It is at rest: as standing, which is the first of its outlines.

@@ -232,7 +232,7 @@ impl<'a> Object<'a> {
         fit.turns = Turns::Given;
         fit.stays = true;
         fit.steps(views, STEPS[1], |share| (if share < 0.5 { 1.0 } else { 0.5 }, 0.0, 0));
-        Some(bend::bent(&fit, &SplitViews::whole(views.to_vec()), 0, bend::ROUGHLY))
+        Some(bend::bent(&fit, &SplitViews::whole(views.to_vec()), 0))
     }
 }
 

@@ -172,7 +172,7 @@ pub(super) fn best_way<'a>(
     };
     if simple.at_rest.is_some_and(|at_rest| at_rest <= BENT_AWAY * error)
         && let Some((fit, level)) = resting
-        && bend::bent(&fit, &contest.views, level, bend::ROUGHLY) <= BENDS_IN_PLACE * error
+        && bend::bent(&fit, &contest.views, level) <= BENDS_IN_PLACE * error
     {
         return Ok(None);
     }

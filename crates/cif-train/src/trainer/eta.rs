@@ -23,7 +23,7 @@ impl Trainer {
             return 0;
         }
         let travelling = self.state.guidance.travelling.iter().enumerate().filter(|(_, travels)| **travels);
-        travelling.filter(|(label, _)| !self.state.objects.has_poses(*label as u16)).count()
+        travelling.filter(|(label, _)| !self.state.objects.is_found(*label as u16)).count()
     }
 
     /// Estimated seconds to the end of the run: the budget's where there is one, else by steps that cost what the last ones

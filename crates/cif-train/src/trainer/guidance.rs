@@ -9,11 +9,13 @@ use glam::DVec3;
 use rand::RngExt;
 
 use super::Trainer;
-use super::objects::in_time;
+use super::objects::{Added, in_time};
 use super::plan_step::plane_weights;
 use crate::effects::appearing::hide_absent;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
+use crate::guidance::PATH_REACH;
+use crate::objects::Bending;
 use crate::optimiser::{Optimiser, StepRates};
 use crate::phase::Phase;
 use crate::random::{Purpose, stream};
@@ -107,15 +109,15 @@ impl Trainer {
         let travels = |label: &u16| self.state.guidance.travelling.get(usize::from(*label)) == Some(&true);
         let travelling: Vec<u16> = (1..=self.state.field.instances.len() as u16).filter(travels).collect();
         let lacking = self.without_gaussians(&travelling)?;
+        let mut added = Added::default();
         if !travelling.is_empty() || !lacking.is_empty() {
             let observations = self.observe(true)?;
             self.fit_travelling()?;
-            let mut posed = Vec::new();
             for (k, seen) in observations.iter().enumerate() {
                 let label = k as u16 + 1;
                 let track = if lacking.contains(&label) {
                     resting(seen)
-                } else if travelling.contains(&label) && !self.add_object(label, &mut posed) {
+                } else if travelling.contains(&label) && !self.add_object(label, &mut added) {
                     fit(seen)
                 } else {
                     continue;
@@ -125,7 +127,7 @@ impl Trainer {
                     self.seed(label, track.unwrap_or_else(|| on_rays(seen, middle)), seen)?;
                 }
             }
-            let notes = hide_absent(&mut self.state, self.simd, &posed)?;
+            let notes = hide_absent(&mut self.state, self.simd, &added.posed)?;
             self.messages.extend(notes);
         }
         let n = self.state.field.len();
@@ -133,19 +135,20 @@ impl Trainer {
         if let Some(tracks) = &mut self.state.field.tracks {
             tracks.group_of.resize(n, cif_field::tracks::NO_GROUP);
         }
-        self.rehearse()
+        self.rehearse(&added.bending)
     }
 
-    /// Teaches the deformation the paths before it sees an image.
-    fn rehearse(&mut self) -> Result<(), TrainError> {
+    /// Teaches the deformation the paths, and how objects deform, before it sees an image.
+    fn rehearse(&mut self, bending: &[(usize, Bending)]) -> Result<(), TrainError> {
         self.state.optimiser = Optimiser::new(&self.state.field);
         self.state.gradients = Gradients::zeros(&self.state.field);
-        if self.state.guidance.guides.is_empty() {
+        if self.state.guidance.guides.is_empty() && bending.is_empty() {
             return Ok(());
         }
         let rates = StepRates::at(&self.state.config, Stage::Fine, 1, &self.state.field).only(&[PLANES, MLP]);
         let weights = plane_weights(&self.state.config);
         let times = self.state.dataset.times.clone();
+        let extent = f64::from(self.state.field.extent);
         let mut rng = stream(self.state.config.seed, Purpose::Guidance, 0);
         let mut renderer = Renderer::new(self.simd);
         let phases = self.state.phases.clone();
@@ -157,16 +160,25 @@ impl Trainer {
                 break;
             }
             phases.advance();
-            let time = times[rng.random_range(0..times.len())];
+            let place = rng.random_range(0..times.len());
+            let time = times[place];
             renderer.displace(&self.state.field, time);
             let guided =
                 self.state.guidance.guide_of.iter().filter(|guide| **guide > 0).count().max(1) as f32;
             let n = self.state.guidance.guide_of.len() as f32;
             // Both kinds count alike here, however few Gaussians travel.
             let state = &mut self.state;
-            let v = state.pulls(time, [n / guided, 1.0]).map_or_else(Vec::new, |pulls| {
+            let mut v = state.pulls(time, [n / guided, 1.0]).map_or_else(Vec::new, |pulls| {
                 state.guidance.gradients(&pulls, &state.field, renderer.posed_means())
             });
+            for (first, bending) in bending {
+                let canonical = &state.field.gaussians.means[*first..][..bending.gaussians.len()];
+                let displaced = &renderer.posed_means()[*first..];
+                // As much in all as everything else, however few they are.
+                let weight = 1.0 / (canonical.len() as f64 * PATH_REACH * extent * extent);
+                let gradients = bending.pulled(place, canonical, displaced, weight);
+                v[*first..][..gradients.len()].copy_from_slice(&gradients);
+            }
             renderer.displace_backward(&state.field, time, v, &mut state.gradients);
             let State { field, gradients, optimiser, times, .. } = state;
             optimiser.step(field, gradients, &rates, &weights, false, times).map_err(|parameter| {

@@ -11,7 +11,7 @@ use glam::{DQuat, DVec2, DVec3};
 use super::Trainer;
 use super::guard_tests::support::{Scene, capture, small_config, stopped_after};
 use super::objects::is_rigid;
-use crate::objects::{Fitted, Found};
+use crate::objects::{Bending, Fitted, Found};
 use crate::stage::Stage;
 
 /// An object without poses yet, which is explained in full.
@@ -92,6 +92,56 @@ fn paths_hold_no_object_that_has_poses() {
     let posed = (0..trainer.state.field.len()).filter(|row| tracks.group(*row).is_some());
     assert!(posed.map(|row| guidance.guide_of[row]).eq([0; 3]));
     assert_eq!(trainer.state.pose_moments.shares, [1.0, 0.1]);
+}
+
+#[test]
+fn what_deforms_is_taught_how_before_the_first_image() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene::default());
+    let times = dataset.times.clone();
+    let mut config = small_config();
+    (config.motion.guidance, config.motion.rehearsal, config.motion.rigid) = (10.0, 300, false);
+    let mut trainer = Trainer::new(dataset, config).unwrap();
+    trainer.state.guidance.travelling = vec![false, true, false, false];
+    // Sheared to the side in the middle of the sequence, the more the higher.
+    let size = 0.15;
+    let sheared = |time: usize| 0.1 * (PI * time as f64 / (times.len() - 1) as f64).sin();
+    let knot = |time: usize| {
+        let mut coefficients = [[0.0; 3]; 10];
+        coefficients[3] = [sheared(time.min(times.len() - 1)), 0.0, 0.0];
+        coefficients
+    };
+    let knots: Vec<_> = (0..=times.len()).map(knot).collect();
+    let shifts = serde_json::json!({ "first": 0, "knot": 1, "size": size, "knots": knots });
+    let grid: Vec<[f32; 3]> =
+        (0..27).map(|k| [k % 3, k / 3 % 3, k / 9].map(|step| 0.12 * (step as f32 - 1.0))).collect();
+    let bending = Bending {
+        gaussians: Gaussians::from_points(&grid, &[[0.5; 3]; 27]).unwrap(),
+        shifts: serde_json::from_value(shifts).unwrap(),
+        place: DVec3::new(0.5, 0.1, 0.3),
+        error: 0.04,
+    };
+    trainer.state.objects.bending.insert(1, bending);
+    let first = trainer.state.field.len();
+    trainer.enter(Stage::Fine).unwrap();
+    let field = &trainer.state.field;
+    let shift = |row: usize, moved: &Gaussians| {
+        let [from, to] = [&field.gaussians, moved].map(|all| DVec3::from(all.means[row].map(f64::from)));
+        to - from
+    };
+    let mut off = 0.0;
+    for (place, time) in times.iter().enumerate() {
+        let moved = field.deformed(*time);
+        for row in first..first + 27 {
+            let height = f64::from(field.gaussians.means[row][2]) - 0.3;
+            let meant = DVec3::new(sheared(place) * height / size, 0.0, 0.0);
+            off += (shift(row, &moved) - meant).length() / (27 * times.len()) as f64;
+        }
+        let others = (0..first).map(|row| shift(row, &moved).length()).sum::<f64>() / first as f64;
+        assert!(others < 0.01, "{others} at {time}");
+    }
+    // The mean shift is 0.034.
+    assert!(off < 0.012, "{off}");
 }
 
 /// A capture of one camera that jumps, in which a rod as thin as two pixels that turns and travels is in the place of the

@@ -16,7 +16,7 @@ use crate::config::ObjectMotion;
 use crate::effects::appearing::Posed;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
-use crate::objects::{self, BENDS_NO_BETTER, Fitted, Found, Order, Plane, Surroundings};
+use crate::objects::{self, BENDS_NO_BETTER, Bending, Fitted, Found, Order, Plane, Surroundings};
 use crate::phase::Phase;
 use crate::schedule::log_linear;
 use crate::stage::Stage;
@@ -81,6 +81,15 @@ pub(super) fn in_time<T>(found: Result<T, TrainError>) -> Result<Option<T>, Trai
     }
 }
 
+/// Objects that were given Gaussians before the fine stage.
+#[derive(Default)]
+pub(super) struct Added {
+    /// What moves as a whole.
+    pub(super) posed: Vec<Posed>,
+    /// What deforms, with the row of its first Gaussian.
+    pub(super) bending: Vec<(usize, Bending)>,
+}
+
 impl Trainer {
     /// Finds objects that move although no path of theirs shows it: a little, late, or in place.
     pub(super) fn find_other_movers(&mut self) -> Result<(), TrainError> {
@@ -92,7 +101,7 @@ impl Trainer {
         let plane = self.support()?;
         let left_out = self.fit_objects(Phase::Search, &others, plane.as_ref())?;
         for label in &others {
-            if self.state.objects.has_poses(*label) {
+            if self.state.objects.is_found(*label) {
                 self.state.guidance.travelling[usize::from(*label)] = true;
             }
         }
@@ -105,7 +114,7 @@ impl Trainer {
         let travelling = self.state.guidance.travelling.iter().enumerate().filter(|(_, travels)| **travels);
         let rest: Vec<u16> = travelling
             .map(|(label, _)| label as u16)
-            .filter(|label| !self.state.objects.has_poses(*label))
+            .filter(|label| !self.state.objects.is_found(*label))
             .collect();
         if rest.is_empty() {
             return Ok(());
@@ -266,9 +275,9 @@ impl Trainer {
         failed.map_or(Ok(left_out), Err)
     }
 
-    /// Gives an object (a label: dense index + 1) that was fitted a group with Gaussians; false where it was not. What
-    /// moves as a whole joins `posed`, with its group.
-    pub(super) fn add_object(&mut self, label: u16, posed: &mut Vec<Posed>) -> bool {
+    /// Gives an object (a label: dense index + 1) that was fitted Gaussians, in a group where it has poses; false where it was
+    /// not. What moves as a whole or deforms joins `added`.
+    pub(super) fn add_object(&mut self, label: u16, added: &mut Added) -> bool {
         let instance = self.state.field.instances[usize::from(label) - 1].clone();
         let name = &instance.label;
         if let Some(fitted) = self.state.objects.moving(label).cloned() {
@@ -281,11 +290,20 @@ impl Trainer {
                 fitted.way, fitted.error
             )));
             let group = self.join(&instance, &fitted);
-            posed.push(Posed { label, group });
+            added.posed.push(Posed { label, group });
             return true;
         }
         if let Some(found) = self.state.objects.jointed(label).cloned() {
             self.add_parts(&instance, &found);
+            return true;
+        }
+        if let Some(found) = self.state.objects.bending.get(&label).cloned() {
+            self.messages.push(TrainEvent::note(format!(
+                "{name} rests, but deforms (error {:.3} on pixels left out)",
+                found.error
+            )));
+            let first = self.add_deforming(&found);
+            added.bending.push((first, found));
             return true;
         }
         self.messages.extend(self.warning_without_poses(label, name));
@@ -371,6 +389,18 @@ impl Trainer {
             deformation.still.resize(before + rows.len(), true);
         }
         place
+    }
+
+    /// Adds the Gaussians of an object that deforms to the field, which the network moves; returns the row of the first.
+    fn add_deforming(&mut self, found: &Bending) -> usize {
+        let mut rows = found.gaussians.clone();
+        for mean in &mut rows.means {
+            *mean = (DVec3::from_array(mean.map(f64::from)) + found.place).as_vec3().to_array();
+        }
+        rows.occupancy_logits.fill(cif_geometry::scalar::logit(self.state.config.instance.occupancy));
+        let first = self.state.field.len();
+        self.state.field.gaussians.append(&rows);
+        first
     }
 
     /// Rate of the poses at a step of a stage; 0 where they stay.

@@ -9,7 +9,7 @@ use super::Trainer;
 use super::objects::in_time;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
-use crate::objects::{self, BENDS_NO_BETTER, Fitted, Jointed, Order, Plane};
+use crate::objects::{self, BENDS_NO_BETTER, Fitted, InPlace, Jointed, Order, Plane};
 use crate::phase::Phase;
 
 impl Trainer {
@@ -32,7 +32,7 @@ impl Trainer {
             self.find_unknown_parts(&unknown, plane)?;
         }
         for label in candidates {
-            if self.state.objects.jointed(label).is_some() {
+            if self.state.objects.is_found_in_place(label) {
                 self.state.guidance.travelling[usize::from(label)] = true;
             }
         }
@@ -52,12 +52,12 @@ impl Trainer {
             state.phases.advance();
             Ok(found)
         };
-        let found: Vec<Result<Option<Option<Jointed>>, TrainError>> = labels.par_iter().map(find).collect();
+        let found: Vec<Result<Option<Option<InPlace>>, TrainError>> = labels.par_iter().map(find).collect();
         drop(entered);
         let (mut left_out, mut failed) = (Vec::new(), None);
         for (label, found) in labels.iter().zip(found) {
             match found {
-                Ok(Some(found)) => self.state.objects.insert_part(*label, found),
+                Ok(Some(found)) => self.state.objects.insert_in_place(*label, found),
                 Ok(None) => left_out.push(*label),
                 Err(error) => failed = failed.or(Some(error)),
             }

@@ -31,12 +31,14 @@ use cif_field::Gaussians;
 use cif_field::tracks::JointKind;
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 pub(super) use self::body::Hinge;
 pub(crate) use self::fits::Jointed;
 use self::fits::{Budget, FINELY, Fit, keep_kinds};
 use self::guesses::Guess;
 use self::scope::Search;
+use super::bend::Shifts;
 use super::discs;
 use super::object::Object;
 use super::rotation::{Turning, turning};
@@ -119,21 +121,63 @@ pub(super) fn turning_ball(object: Object<'_>) -> Result<Option<Jointed>, TrainE
     Ok(Some(found.moved(ball.centre)))
 }
 
-/// Looks for a part on a joint of an object that is otherwise at rest.
+/// Motion of an object that stays where it is.
+pub(crate) enum InPlace {
+    /// A part on a joint.
+    Jointed(Jointed),
+    /// All of it deforms.
+    Bends(Bending),
+}
+
+/// An object that deforms where it stands.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(crate) struct Bending {
+    /// In the frame of the object.
+    #[serde(skip)]
+    pub(crate) gaussians: Gaussians,
+    /// Shifts of its places in this frame.
+    pub(crate) shifts: Shifts,
+    /// Its frame, in the world.
+    pub(crate) place: DVec3,
+    /// Error on pixels left out.
+    pub(crate) error: f64,
+}
+
+impl Bending {
+    /// Gradients, of a weight by metre, that pull displaced places of the object in the world to where they are at a time.
+    pub(crate) fn pulled(
+        &self,
+        time: usize,
+        canonical: &[[f32; 3]],
+        displaced: &[[f32; 3]],
+        weight: f64,
+    ) -> Vec<[f32; 3]> {
+        let own = |place: &[f32; 3]| DVec3::from_array(place.map(f64::from)) - self.place;
+        let places: Vec<DVec3> = canonical.iter().map(own).collect();
+        let shifted = self.shifts.shifted(time, &places);
+        let pull = |(now, meant): (&[f32; 3], DVec3)| (weight * (own(now) - meant)).as_vec3().to_array();
+        displaced.iter().zip(shifted).map(pull).collect()
+    }
+}
+
+/// Looks for a part on a joint of an object that is otherwise at rest, or how it deforms.
 ///
 /// # Errors
 /// [`TrainError::Stopped`] when the run is to stop.
-pub(super) fn find(object: Object<'_>) -> Result<Option<Jointed>, TrainError> {
+pub(super) fn find(object: Object<'_>) -> Result<Option<InPlace>, TrainError> {
     let views = object.views;
     let rays = views.iter().map(|view| (view, view.visible.powi(2)));
     let Some(place) = meeting_point(rays) else { return Ok(None) };
     let at_rest = Pose { rotation: DQuat::IDENTITY, translation: place };
     let base: BTreeMap<usize, Pose> = views.iter().map(|view| (view.time_index, at_rest)).collect();
-    Ok(find_on(object, &base)?.map(|found| found.moved(place)))
+    Ok(find_on(object, &base)?.map(|found| match found {
+        InPlace::Jointed(found) => InPlace::Jointed(found.moved(place)),
+        InPlace::Bends(found) => InPlace::Bends(Bending { place: found.place + place, ..found }),
+    }))
 }
 
 /// The part in the frame of an object whose poses (world from object, by time) are known.
-fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jointed>, TrainError> {
+fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<InPlace>, TrainError> {
     let views = object.views;
     let phases = object.surroundings.phases;
     let is_usable = |view: &usize| views[*view].is_reliable() && base.contains_key(&views[*view].time_index);
@@ -200,8 +244,10 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
     };
     let taken = fine.iter().position(is_simple).unwrap_or(0);
     let Fit { body, loss: error, .. } = fine.swap_remove(taken);
-    if error > GAIN * still || search.bent().is_some_and(|bent| bent < DEFORMS * error) {
+    if error > GAIN * still {
         return Ok(None);
     }
-    Ok(search.finished(body, [error, still]))
+    let bending = search.bending().filter(|bending| bending.error < DEFORMS * error);
+    let jointed = || search.finished(body, [error, still]).map(InPlace::Jointed);
+    Ok(bending.map(InPlace::Bends).or_else(jointed))
 }

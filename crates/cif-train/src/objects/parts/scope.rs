@@ -11,6 +11,7 @@ use super::super::object::Object;
 use super::super::shape::{Pose, Shape};
 use super::super::split::{SplitViews, times_of};
 use super::super::view::{is_one_camera, median};
+use super::Bending;
 use super::body::{Body, Part, PosedObject};
 
 /// Most views of a time that values are searched on.
@@ -99,13 +100,14 @@ impl<'a> Search<'a> {
         Some(body)
     }
 
-    /// Error of the object where it bends on its base, on the views that were left out.
-    pub(super) fn bent(&self) -> Option<f64> {
+    /// The object as it bends on its base.
+    pub(super) fn bending(&self) -> Option<Bending> {
         let shape = self.hull(self.base, None, BENT)?;
         let mut fit = self.object.fit(self.base.clone(), shape, self.object.rng());
         fit.turns = Turns::Given;
         fit.stays = true;
-        Some(bend::bent(&fit, &self.views, 0, bend::WELL))
+        let (gaussians, shifts, error) = bend::bending(&fit, &self.views)?;
+        Some(Bending { gaussians, shifts, place: DVec3::ZERO, error })
     }
 
     /// The object without parts as it looks in the row of times that are most alike, with the views of these.

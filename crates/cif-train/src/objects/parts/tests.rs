@@ -12,10 +12,13 @@ use super::super::testing::{
     Cameras, FLOOR, TIMES, faces, moving, patches, rig, solid, sphere_places, views_of_groups, with_objects,
 };
 use super::super::view::ObjectView;
-use super::Jointed;
+use super::{InPlace, Jointed};
 
 fn find(views: &[ObjectView]) -> Option<Jointed> {
-    with_objects(Some(&FLOOR), views, |objects| parts::find(objects[0]).unwrap())
+    match with_objects(Some(&FLOOR), views, |objects| parts::find(objects[0]).unwrap())? {
+        InPlace::Jointed(found) => Some(found),
+        InPlace::Bends(found) => panic!("bends, {}", found.error),
+    }
 }
 
 /// Share of the way at a time: it stands, goes, and stands.
