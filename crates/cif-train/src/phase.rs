@@ -34,7 +34,7 @@ pub enum Phase {
     Objects,
     /// Objects are tried for being absent at times.
     Presence,
-    /// The deformation network learns the paths of objects that have no poses.
+    /// The deformation network learns the paths of objects that have no poses, and how others deform.
     Rehearsal,
     /// Steps of the fine stage.
     Fine,

@@ -207,7 +207,7 @@ pub struct MotionConfig {
     pub guidance_end: f32,
     /// Weight of the displacement of everything that does not travel, relative to the extent; default 1.
     pub stillness: f32,
-    /// Steps that teach the deformation the paths before the fine stage, default 300.
+    /// Steps that teach the deformation the paths, and how objects deform, before the fine stage, default 300.
     pub rehearsal: u32,
     /// True where objects that are rigid move by a trained pose per time instead of the network; needs `guidance`;
     /// default true.
