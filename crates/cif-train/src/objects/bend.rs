@@ -68,10 +68,11 @@ impl Shifts {
         places.iter().map(|place| *place + shift(place)).collect()
     }
 
-    /// True where numbers that were saved are shifts.
-    pub(crate) fn are_sound(&self) -> bool {
+    /// True where numbers that were saved are shifts, of a capture with so many times.
+    pub(crate) fn are_sound(&self, times: usize) -> bool {
         let are_finite = self.knots.iter().flatten().all(|coefficient| coefficient.is_finite());
-        self.knots.len() > 1 && self.knot > 0 && self.size > 0.0 && are_finite
+        let has_knots = self.first < times && (1..=times).contains(&self.knot) && self.knots.len() > 1;
+        has_knots && self.size > 0.0 && are_finite
     }
 }
 

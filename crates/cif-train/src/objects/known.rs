@@ -141,7 +141,7 @@ impl KnownObjects {
             let last = found.values.last_key_value();
             last.is_some_and(|(time, _)| *time < times)
         });
-        let of_bending = known.bending.values().map(|found| found.shifts.are_sound());
+        let of_bending = known.bending.values().map(|found| found.shifts.are_sound(times));
         if !are_labels || !of_rigid.chain(of_parts).chain(of_bending).all(|fits| fits) {
             return None;
         }
@@ -209,5 +209,30 @@ mod tests {
         let mut known = KnownObjects::default();
         known.insert_in_place(1, Some(InPlace::Jointed(part(0.2))));
         assert!(known.jointed(1).is_some());
+    }
+
+    fn bending(knot: usize) -> Bending {
+        let knots = vec![[[0.25; 3]; 10]; 2];
+        let shifts = serde_json::json!({ "first": 1, "knot": knot, "size": 0.5, "knots": knots });
+        let gaussians = Gaussians::from_points(&[[0.5, 0.0, 0.25]], &[[0.5; 3]]).unwrap();
+        let shifts = serde_json::from_value(shifts).unwrap();
+        Bending { gaussians, shifts, place: DVec3::X, error: 0.1 }
+    }
+
+    #[test]
+    fn what_deforms_comes_back_as_it_was_saved_and_damage_shows() {
+        let restored = |knot: usize, times: usize| {
+            let mut known = KnownObjects::default();
+            known.insert_in_place(1, Some(InPlace::Bends(bending(knot))));
+            let (json, tensors) = known.saved();
+            KnownObjects::restored(json.unwrap(), &mut tensors.into_iter().collect(), 1, times)
+        };
+        let known = restored(2, 3).unwrap();
+        assert!(known.is_found(1) && known.jointed(1).is_none());
+        let (found, saved) = (&known.bending[&1], bending(2));
+        assert_eq!((&found.gaussians, found.place), (&saved.gaussians, saved.place));
+        let shifted = |bending: &Bending| bending.shifts.shifted(2, &[DVec3::splat(0.5)]);
+        assert_eq!(shifted(found), shifted(&saved));
+        assert!(restored(0, 3).is_none() && restored(2, 1).is_none());
     }
 }

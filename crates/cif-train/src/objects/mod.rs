@@ -21,11 +21,11 @@
 //! | `grow` | where it is when little of it is seen |
 //! | `mend` | which of its poses jump, and where they belong |
 //! | `trials` | which way is kept |
-//! | `bend` | whether it rather deforms |
+//! | `bend` | whether it rather deforms, and how |
 //! | `start` | everything in order |
 //! | `rotation` | whether the pictures show how it turns |
 //! | `discs` | whether it is a ball on a stand |
-//! | `parts` | which part of it turns on a hinge or slides |
+//! | `parts` | which part of it turns on a hinge or slides, where it stays in place |
 //! | `known` | what was found of all objects, saved with the run |
 
 mod ball;

@@ -500,7 +500,7 @@ mod tests {
     use glam::DQuat;
     use rand::RngExt;
 
-    use super::super::testing::{FLOOR, TIMES, faces, jumping, moving, rig, solid, sphere_places, views};
+    use super::super::testing::{FLOOR, TIMES, jumping, moving, rig, sides, solid, sphere_places, views};
     use super::*;
     use crate::random::{Purpose, stream};
 
@@ -519,7 +519,7 @@ mod tests {
     fn what_looks_larger_where_it_rests_is_not_off_its_support() {
         // A block that stands with its broad side to the camera, is lifted, and put down with its narrow side to it.
         let size = DVec3::new(0.045, 0.025, 0.05);
-        let places = faces(-size, size, 1500, 31);
+        let places = sides(size, 31);
         let pose = |time: usize| {
             let share = ((time as f64 - 9.0) / 10.0).clamp(0.0, 1.0);
             let up = 0.1 * (std::f64::consts::PI * share).sin();

@@ -174,14 +174,14 @@ pub(super) fn patches(p: DVec3) -> [f32; 3] {
     })
 }
 
-/// Places on the faces of a box.
-pub(super) fn faces(low: DVec3, high: DVec3, count: usize, seed: u64) -> Vec<DVec3> {
+/// Places on the sides of a box around the origin, by half its extents.
+pub(super) fn sides(half: DVec3, seed: u64) -> Vec<DVec3> {
     let mut rng = stream(0, Purpose::Objects, seed);
-    (0..count)
+    (0..1500)
         .map(|k| {
-            let mut p = low + (high - low) * DVec3::from(std::array::from_fn(|_| rng.random::<f64>()));
-            p[k % 3] = if (k / 3) % 2 == 0 { low[k % 3] } else { high[k % 3] };
-            p
+            let mut p = DVec3::from(std::array::from_fn(|_| 2.0 * rng.random::<f64>() - 1.0));
+            p[k % 3] = if (k / 3) % 2 == 0 { 1.0 } else { -1.0 };
+            half * p
         })
         .collect()
 }

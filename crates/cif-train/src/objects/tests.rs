@@ -20,7 +20,7 @@ use super::shape::Pose;
 use super::split::SplitViews;
 use super::start::{Fitted, fit_object};
 use super::testing::{
-    Cameras, FLOOR, TIMES, camera, faces, jumping, moving, patches, rig, solid, sphere_places, views,
+    self, Cameras, FLOOR, TIMES, camera, jumping, moving, patches, rig, solid, sphere_places, views,
     views_in_masks, views_of_groups, with_objects,
 };
 use super::view::ObjectView;
@@ -64,9 +64,8 @@ fn in_true_poses<'a>(
     object.fit(poses, shape, object.rng())
 }
 
-/// Places on the sides of a box, by half its extents.
 fn sides(half: DVec3) -> Vec<DVec3> {
-    faces(-half, half, 1500, 9)
+    testing::sides(half, 9)
 }
 
 fn box_places() -> Vec<DVec3> {

@@ -15,7 +15,9 @@
 //! | `promise` | which joints are tried further |
 //! | `body` | base, part and joint, moved together |
 //! | `fits` | which joint is kept, and what it moves |
+//! | `bending` | where places of what deforms instead are over time |
 
+mod bending;
 mod body;
 mod fits;
 mod guesses;
@@ -31,14 +33,13 @@ use cif_field::Gaussians;
 use cif_field::tracks::JointKind;
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
+pub(crate) use self::bending::Bending;
 pub(super) use self::body::Hinge;
 pub(crate) use self::fits::Jointed;
 use self::fits::{Budget, FINELY, Fit, keep_kinds};
 use self::guesses::Guess;
 use self::scope::Search;
-use super::bend::Shifts;
 use super::discs;
 use super::object::Object;
 use super::rotation::{Turning, turning};
@@ -127,37 +128,6 @@ pub(crate) enum InPlace {
     Jointed(Jointed),
     /// All of it deforms.
     Bends(Bending),
-}
-
-/// An object that deforms where it stands.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-pub(crate) struct Bending {
-    /// In the frame of the object.
-    #[serde(skip)]
-    pub(crate) gaussians: Gaussians,
-    /// Shifts of its places in this frame.
-    pub(crate) shifts: Shifts,
-    /// Its frame, in the world.
-    pub(crate) place: DVec3,
-    /// Error on pixels left out.
-    pub(crate) error: f64,
-}
-
-impl Bending {
-    /// Gradients, of a weight by metre, that pull displaced places of the object in the world to where they are at a time.
-    pub(crate) fn pulled(
-        &self,
-        time: usize,
-        canonical: &[[f32; 3]],
-        displaced: &[[f32; 3]],
-        weight: f64,
-    ) -> Vec<[f32; 3]> {
-        let own = |place: &[f32; 3]| DVec3::from_array(place.map(f64::from)) - self.place;
-        let places: Vec<DVec3> = canonical.iter().map(own).collect();
-        let shifted = self.shifts.shifted(time, &places);
-        let pull = |(now, meant): (&[f32; 3], DVec3)| (weight * (own(now) - meant)).as_vec3().to_array();
-        displaced.iter().zip(shifted).map(pull).collect()
-    }
 }
 
 /// Looks for a part on a joint of an object that is otherwise at rest, or how it deforms.

@@ -11,7 +11,7 @@ use super::super::object::Object;
 use super::super::shape::{Pose, Shape};
 use super::super::split::{SplitViews, times_of};
 use super::super::view::{is_one_camera, median};
-use super::Bending;
+use super::bending::Bending;
 use super::body::{Body, Part, PosedObject};
 
 /// Most views of a time that values are searched on.

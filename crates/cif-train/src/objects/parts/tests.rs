@@ -5,20 +5,34 @@ use std::f64::consts::PI;
 use cif_field::Gaussians;
 use cif_field::tracks::JointKind;
 use glam::{DQuat, DVec3};
+use rand::RngExt;
 
 use super::super::discs;
 use super::super::parts;
 use super::super::testing::{
-    Cameras, FLOOR, TIMES, faces, moving, patches, rig, solid, sphere_places, views_of_groups, with_objects,
+    Cameras, FLOOR, TIMES, moving, patches, rig, solid, sphere_places, views_of_groups, with_objects,
 };
 use super::super::view::ObjectView;
 use super::{InPlace, Jointed};
+use crate::random::{Purpose, stream};
 
 fn find(views: &[ObjectView]) -> Option<Jointed> {
     match with_objects(Some(&FLOOR), views, |objects| parts::find(objects[0]).unwrap())? {
         InPlace::Jointed(found) => Some(found),
         InPlace::Bends(found) => panic!("bends, {}", found.error),
     }
+}
+
+/// Places on the faces of a box.
+fn faces(low: DVec3, high: DVec3, count: usize, seed: u64) -> Vec<DVec3> {
+    let mut rng = stream(0, Purpose::Objects, seed);
+    (0..count)
+        .map(|k| {
+            let mut p = low + (high - low) * DVec3::from(std::array::from_fn(|_| rng.random::<f64>()));
+            p[k % 3] = if (k / 3) % 2 == 0 { low[k % 3] } else { high[k % 3] };
+            p
+        })
+        .collect()
 }
 
 /// Share of the way at a time: it stands, goes, and stands.
