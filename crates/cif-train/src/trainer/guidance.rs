@@ -135,6 +135,9 @@ impl Trainer {
         if let Some(tracks) = &mut self.state.field.tracks {
             tracks.group_of.resize(n, cif_field::tracks::NO_GROUP);
         }
+        if let Some(deformation) = self.state.field.deformation.as_mut().filter(|d| !d.still.is_empty()) {
+            deformation.still.resize(n, false);
+        }
         self.rehearse(&added.bending)
     }
 

@@ -91,6 +91,8 @@ fn paths_hold_no_object_that_has_poses() {
     let tracks = trainer.state.field.tracks.as_ref().unwrap();
     let posed = (0..trainer.state.field.len()).filter(|row| tracks.group(*row).is_some());
     assert!(posed.map(|row| guidance.guide_of[row]).eq([0; 3]));
+    let still = &trainer.state.field.deformation.as_ref().unwrap().still;
+    assert_eq!(still.len(), trainer.state.field.len(), "those after the one in between, too");
     assert_eq!(trainer.state.pose_moments.shares, [1.0, 0.1]);
 }
 

@@ -6,6 +6,7 @@ use cif_dataset::meant::known_names;
 use cif_field::Gaussians;
 use cif_field::Instance;
 use cif_field::tracks::{NO_GROUP, RotationEvidence, TrackGroup, TrackPose, Tracks};
+use cif_geometry::scalar::logit;
 use cif_render::cpu::Renderer;
 use cif_render::{Channels, RenderSettings};
 use glam::{DVec2, DVec3};
@@ -372,23 +373,29 @@ impl Trainer {
 
     /// Adds Gaussians to the field, in a group of their own that skips the network; returns its place. Its poses are
     /// trained at `shares` of the common rate.
-    pub(super) fn add_group(&mut self, mut rows: Gaussians, group: TrackGroup, shares: &[f64]) -> u32 {
+    pub(super) fn add_group(&mut self, rows: Gaussians, group: TrackGroup, shares: &[f64]) -> u32 {
         self.state.pose_moments.extend(shares);
-        let occupancy = cif_geometry::scalar::logit(self.state.config.instance.occupancy);
-        rows.occupancy_logits.fill(occupancy);
+        let before = self.append(rows);
         let field = &mut self.state.field;
-        let before = field.len();
+        let now = field.len();
         let tracks = field.tracks.get_or_insert_with(Tracks::default);
         let place = tracks.groups.len() as u32;
         tracks.group_of.resize(before, NO_GROUP);
-        tracks.group_of.resize(before + rows.len(), place);
+        tracks.group_of.resize(now, place);
         tracks.groups.push(group);
-        field.gaussians.append(&rows);
         if let Some(deformation) = &mut field.deformation {
             deformation.still.resize(before, false);
-            deformation.still.resize(before + rows.len(), true);
+            deformation.still.resize(now, true);
         }
         place
+    }
+
+    /// Adds Gaussians to the field, as occupied as all are at first; returns the row of the first.
+    pub(super) fn append(&mut self, mut rows: Gaussians) -> usize {
+        rows.occupancy_logits.fill(logit(self.state.config.instance.occupancy));
+        let first = self.state.field.len();
+        self.state.field.gaussians.append(&rows);
+        first
     }
 
     /// Adds the Gaussians of an object that deforms to the field, which the network moves; returns the row of the first.
@@ -397,10 +404,7 @@ impl Trainer {
         for mean in &mut rows.means {
             *mean = (DVec3::from_array(mean.map(f64::from)) + found.place).as_vec3().to_array();
         }
-        rows.occupancy_logits.fill(cif_geometry::scalar::logit(self.state.config.instance.occupancy));
-        let first = self.state.field.len();
-        self.state.field.gaussians.append(&rows);
-        first
+        self.append(rows)
     }
 
     /// Rate of the poses at a step of a stage; 0 where they stay.

@@ -103,11 +103,10 @@ impl Trainer {
         }
         let mut fresh = Gaussians::from_points(&positions, &colors)?;
         fresh.opacity_logits.fill(logit(OPACITY));
-        fresh.occupancy_logits.fill(logit(self.state.config.instance.occupancy));
+        let first = self.append(fresh);
         // Objects with poses came in between, which no path holds.
         let State { field, guidance, .. } = &mut self.state;
-        guidance.guide_of.resize(field.len(), 0);
-        field.gaussians.append(&fresh);
+        guidance.guide_of.resize(first, 0);
         guidance.guides.push(Guide { track, reference });
         guidance.guide_of.resize(field.len(), guidance.guides.len() as u16);
         Ok(())

@@ -271,6 +271,12 @@ impl Seen {
         layered(evidence, &paint, &light, turns)
     }
 
+    /// The turns about an axis that explain most.
+    pub(super) fn turned_about(&self, axis: DVec3) -> Turned {
+        let painted = self.painted(axis);
+        self.finely(painted.further(painted.roughly()))
+    }
+
     /// The same turns in smaller steps.
     pub(super) fn finely(&self, turned: Turned) -> Turned {
         self.painted(turned.axis).improved(turned, 1, TURNS[1])

@@ -87,8 +87,7 @@ impl<'a> Revolving<'a> {
     pub(in super::super) fn turned(&self, axis: DVec3) -> Option<Course> {
         let solid = self.solid(axis, None)?;
         let shown = solid.shown(None)?;
-        let painted = shown.few.painted(axis);
-        let found = shown.few.finely(painted.further(painted.roughly()));
+        let found = shown.few.turned_about(axis);
         shown.errors(&self.evidence, &found)?;
         shown.turns(&self.evidence, &found).then(|| shown.turning(&found).about(self.course, solid.middle))
     }

@@ -87,8 +87,7 @@ impl Shown {
         let is_above = |spot: &Spot| spot.place.dot(axis) > middle;
         let [above, below] = [true, false].map(|above| {
             let half = self.few.only(|spot| is_above(spot) == above);
-            let painted = half.painted(axis);
-            self.all.residuals(evidence, &half.finely(painted.further(painted.roughly())), true)
+            self.all.residuals(evidence, &half.turned_about(axis), true)
         });
         let mut crossed = vec![f32::NAN; evidence.len()];
         for spot in &self.all.spots {

@@ -87,8 +87,7 @@ fn shown_turns(degrees: f64, radius: f64, cameras: Cameras) -> [bool; 2] {
     let place =
         |look: &Look<'_>, pixel: &Pixel| ball.outward(look.view.camera.centre(), pixel.ray.normalize());
     let shown = Shown::of(&evidence, Cells::OfBall(24.0), place).unwrap();
-    let painted = shown.few.painted(DVec3::Z);
-    let found = shown.few.finely(painted.further(painted.roughly()));
+    let found = shown.few.turned_about(DVec3::Z);
     [shown.errors(&evidence, &found).is_some(), shown.turns(&evidence, &found)]
 }
 
