@@ -8,7 +8,7 @@ use cif_field::checkpoint::StateTensor;
 use cif_geometry::PixelGrid;
 use glam::DVec3;
 
-use crate::losses::displacement::{Pose, Pull, displacement_loss, rotations};
+use crate::losses::displacement::{FREE, Pose, Pull, displacement_loss, pose_index, rotations};
 use crate::tracks::Track;
 
 /// Distance from the path beyond which the pull no longer grows, relative to the extent.
@@ -31,7 +31,7 @@ pub(crate) struct Guidance {
     /// Per label (dense index + 1), whether the instance travels.
     pub travelling: Vec<bool>,
     pub guides: Vec<Guide>,
-    /// Per Gaussian its guide + 1, 0 for what does not travel.
+    /// Per Gaussian its guide + 1, 0 for what is held in place, [`FREE`] for what deforms.
     pub guide_of: Vec<u16>,
 }
 
@@ -41,9 +41,21 @@ impl Guidance {
         !self.guides.is_empty()
     }
 
-    /// True when a Gaussian was made for a travelling object.
-    pub(crate) fn travels(&self, row: usize) -> bool {
+    /// True when a Gaussian was made for an object that travels or deforms.
+    pub(crate) fn moves(&self, row: usize) -> bool {
         self.guide_of.get(row).is_some_and(|guide| *guide > 0)
+    }
+
+    /// Gaussians that are held to a path.
+    pub(crate) fn guided(&self) -> usize {
+        self.guide_of.iter().filter(|of| pose_index(**of).is_some()).count()
+    }
+
+    /// Says of `n` Gaussians, the last of the field and the first that were not spoken of yet but for those with poses, what
+    /// holds them.
+    pub(crate) fn extend(&mut self, first: usize, n: usize, guide: u16) {
+        self.guide_of.resize(first, 0);
+        self.guide_of.resize(first + n, guide);
     }
 
     pub(crate) fn gather(&mut self, parents: &[u32]) {
@@ -108,7 +120,8 @@ impl Guidance {
                 },
             });
         }
-        let fits = guide_of.len() == n && guide_of.iter().all(|of| *of as usize <= guides.len());
+        let fits = guide_of.len() == n
+            && guide_of.iter().all(|of| *of as usize <= guides.len() || *of == u32::from(FREE));
         (fits && places.is_empty()).then(|| {
             self.guide_of = guide_of.into_iter().map(|of| of as u16).collect();
             self.guides = guides;

@@ -81,10 +81,10 @@ fn rows_of_instances(field: &Field) -> Vec<Option<usize>> {
         .collect()
 }
 
-/// True for Gaussians that were made for a travelling object, or that have poses.
+/// True for Gaussians that were made for an object that travels or deforms, or that have poses.
 fn is_mover(state: &State, row: usize) -> bool {
     let is_posed = state.field.tracks.as_ref().is_some_and(|tracks| tracks.group(row).is_some());
-    is_posed || state.guidance.travels(row)
+    is_posed || state.guidance.moves(row)
 }
 
 /// Instances of which something goes through the network that is no mover, and that are not declared free.

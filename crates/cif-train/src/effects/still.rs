@@ -56,7 +56,7 @@ impl Effect for Still {
         let mut error = bench.error(None)?;
         let mut settled = None;
         if bench.moment().has(Due::StillByMasks) {
-            let stands = |row: usize| !evidence.watched[row] && !evidence.travels[row];
+            let stands = |row: usize| !evidence.watched[row] && !evidence.moves[row];
             settled = try_to_settle(bench, &evidence.motions, stands, &mut error, MASKS_LOSS)?;
         }
         let mut released = 0;
@@ -83,8 +83,8 @@ struct Evidence {
     highest: Limits,
     /// Those that go through the network until the next test though they could stand still.
     watched: Vec<bool>,
-    /// Those that were made for a travelling object.
-    travels: Vec<bool>,
+    /// Those that were made for an object that travels or deforms.
+    moves: Vec<bool>,
     /// Those that are not to settle, whatever the network does to them.
     awake: Vec<bool>,
 }
@@ -111,7 +111,7 @@ impl Evidence {
             watched[row] = false;
         }
         let state = &*bench.state;
-        let travels: Vec<bool> = (0..motions.len()).map(|row| state.guidance.travels(row)).collect();
+        let moves: Vec<bool> = (0..motions.len()).map(|row| state.guidance.moves(row)).collect();
         let restless = restless(&state.field, &motions, highest);
         // In the second half the network has learnt what moves.
         let last = bench.step.facts.stages.iterations(&state.config, stage);
@@ -120,10 +120,10 @@ impl Evidence {
             .map(|row| match sights.get(row) {
                 Some(Sight::Steady) => false,
                 Some(Sight::Changing) if learns => true,
-                _ => watched[row] || restless[row] || (learns && travels[row]),
+                _ => watched[row] || restless[row] || (learns && moves[row]),
             })
             .collect();
-        Ok(Some(Self { motions, highest, watched, travels, awake }))
+        Ok(Some(Self { motions, highest, watched, moves, awake }))
     }
 }
 

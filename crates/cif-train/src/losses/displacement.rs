@@ -1,7 +1,16 @@
 //! Displacement loss, which holds Gaussians to known motion: travelling objects to a path and to moving as one rigid
-//! body, everything else to its place.
+//! body, what deforms to nothing, everything else to its place.
 
 use glam::{DMat3, DVec3};
+
+/// Stands for the index of a pose + 1 where a Gaussian deforms: nothing holds it.
+pub const FREE: u16 = u16::MAX;
+
+/// Index of the pose that a Gaussian is held to; `None` where it is held in place, or by nothing.
+#[must_use]
+pub fn pose_index(pose_of: u16) -> Option<usize> {
+    (pose_of != FREE).then(|| usize::from(pose_of).checked_sub(1)).flatten()
+}
 
 /// Motion that the Gaussians of one object are held to at a time.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -33,7 +42,7 @@ impl Pull {
 }
 
 /// Loss and its gradients by the displaced centres `[N]`. `pose_of` is the index into `poses` + 1 of each
-/// Gaussian, or 0 for what is held in place. Per object, the mean of its centres is held to the path, and
+/// Gaussian, 0 for what is held in place, or [`FREE`]. Per object, the mean of its centres is held to the path, and
 /// each centre to the rigid body around the mean; rotations count as constants.
 ///
 /// The loss is the mean over all Gaussians, relative to `extent` (metres).
@@ -54,11 +63,8 @@ pub fn displacement_loss(
         let (_, now, before) = means[of];
         (point(displaced[row]) - now) - poses[of].rotation * (point(canonical[row]) - before)
     };
-    for (row, pose) in pose_of.iter().enumerate() {
-        if *pose > 0 {
-            let of = usize::from(*pose) - 1;
-            v_means[of] += path.gradient(rigid(row, of));
-        }
+    for (row, of) in posed(pose_of) {
+        v_means[of] += path.gradient(rigid(row, of));
     }
     for (of, (count, now, before)) in means.iter().enumerate().filter(|(_, (count, _, _))| *count > 0.0) {
         let away = *now - *before - poses[of].shift;
@@ -68,14 +74,14 @@ pub fn displacement_loss(
     }
     let gradients = (0..displaced.len())
         .map(|row| {
-            let v = match pose_of[row] {
-                0 => {
+            let v = match pose_index(pose_of[row]) {
+                None if pose_of[row] == FREE => DVec3::ZERO,
+                None => {
                     let r = point(displaced[row]) - point(canonical[row]);
                     loss += place.cost(r);
                     place.gradient(r)
                 }
-                pose => {
-                    let of = usize::from(pose) - 1;
+                Some(of) => {
                     let r = rigid(row, of);
                     loss += path.cost(r);
                     path.gradient(r) + v_means[of]
@@ -98,10 +104,10 @@ pub fn rotations(
 ) -> Vec<DMat3> {
     let means = centre_pairs(displaced, canonical, pose_of, poses);
     let mut correlations = vec![DMat3::ZERO; poses];
-    for (row, pose) in pose_of.iter().enumerate().filter(|(_, pose)| **pose > 0) {
-        let (_, now, before) = means[usize::from(*pose) - 1];
+    for (row, of) in posed(pose_of) {
+        let (_, now, before) = means[of];
         let (a, b) = (point(displaced[row]) - now, point(canonical[row]) - before);
-        correlations[usize::from(*pose) - 1] += DMat3::from_cols(a * b.x, a * b.y, a * b.z);
+        correlations[of] += DMat3::from_cols(a * b.x, a * b.y, a * b.z);
     }
     correlations.into_iter().map(nearest_rotation).collect()
 }
@@ -136,8 +142,8 @@ fn centre_pairs(
     poses: usize,
 ) -> Vec<(f64, DVec3, DVec3)> {
     let mut sums = vec![(0.0, DVec3::ZERO, DVec3::ZERO); poses];
-    for (row, pose) in pose_of.iter().enumerate().filter(|(_, pose)| **pose > 0) {
-        let (count, now, before) = &mut sums[usize::from(*pose) - 1];
+    for (row, of) in posed(pose_of) {
+        let (count, now, before) = &mut sums[of];
         *count += 1.0;
         *now += point(displaced[row]);
         *before += point(canonical[row]);
@@ -145,6 +151,11 @@ fn centre_pairs(
     let mean =
         |(count, now, before): (f64, DVec3, DVec3)| (count, now / count.max(1.0), before / count.max(1.0));
     sums.into_iter().map(mean).collect()
+}
+
+/// Rows that are held to a pose, and which.
+fn posed(pose_of: &[u16]) -> impl Iterator<Item = (usize, usize)> {
+    pose_of.iter().enumerate().filter_map(|(row, pose)| Some((row, pose_index(*pose)?)))
 }
 
 fn point(p: [f32; 3]) -> DVec3 {
@@ -155,7 +166,7 @@ fn point(p: [f32; 3]) -> DVec3 {
 mod tests {
     use super::*;
 
-    /// 40 points: 15 and 10 of two objects, the others at rest.
+    /// 40 points: 15 and 10 of two objects, 5 free, the others at rest.
     fn scene() -> (Vec<[f32; 3]>, Vec<[f32; 3]>, Vec<u16>) {
         let wave = |k: usize, s: f64| (k as f64 * s).sin();
         let canonical: Vec<[f32; 3]> =
@@ -169,7 +180,9 @@ mod tests {
                 (moved + noise).as_vec3().to_array()
             })
             .collect();
-        let pose_of = (0..40).map(|k| if k < 15 { 1 } else { 2 * u16::from(k < 25) }).collect();
+        let pose_of = [(15, 1), (10, 2), (10, 0), (5, FREE)];
+        let pose_of =
+            pose_of.into_iter().flat_map(|(count, pose)| std::iter::repeat_n(pose, count)).collect();
         (displaced, canonical, pose_of)
     }
 
@@ -186,7 +199,8 @@ mod tests {
         let loss = |d: &[[f32; 3]]| displacement_loss(d, &canonical, &pose_of, &poses, PULLS, 1.7);
         let (_, gradients) = loss(&displaced);
         let mut largest = 0.0_f64;
-        for row in [0, 7, 14, 15, 24, 25, 39] {
+        assert_eq!(gradients[35..], [[0.0; 3]; 5], "what is free is held by nothing");
+        for row in [0, 7, 14, 15, 24, 25, 34, 39] {
             for axis in 0..3 {
                 // Differences of what single precision stores, in double precision.
                 let (mut low, mut high) = (displaced.clone(), displaced.clone());

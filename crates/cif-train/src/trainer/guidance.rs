@@ -166,9 +166,8 @@ impl Trainer {
             let place = rng.random_range(0..times.len());
             let time = times[place];
             renderer.displace(&self.state.field, time);
-            let guided =
-                self.state.guidance.guide_of.iter().filter(|guide| **guide > 0).count().max(1) as f32;
-            let n = self.state.guidance.guide_of.len() as f32;
+            let guidance = &self.state.guidance;
+            let (guided, n) = (guidance.guided().max(1) as f32, guidance.guide_of.len() as f32);
             // Both kinds count alike here, however few Gaussians travel.
             let state = &mut self.state;
             let mut v = state.pulls(time, [n / guided, 1.0]).map_or_else(Vec::new, |pulls| {

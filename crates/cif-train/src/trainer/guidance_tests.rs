@@ -11,6 +11,8 @@ use glam::{DQuat, DVec2, DVec3};
 use super::Trainer;
 use super::guard_tests::support::{Scene, capture, small_config, stopped_after};
 use super::objects::is_rigid;
+use crate::guidance::Guidance;
+use crate::losses::displacement::FREE;
 use crate::objects::{Bending, Fitted, Found};
 use crate::stage::Stage;
 
@@ -144,6 +146,13 @@ fn what_deforms_is_taught_how_before_the_first_image() {
     }
     // The mean shift is 0.034.
     assert!(off < 0.012, "{off}");
+    // Nothing pulls it back to its place while images train it, after a pause as well.
+    let mut restored = Guidance::default();
+    let stored = trainer.state.guidance.tensors();
+    let mut stored = stored.into_iter().map(|(name, tensor)| (name.to_owned(), tensor)).collect();
+    restored.restore(&mut stored, field.len(), times.len()).unwrap();
+    let of = |row: usize| if (first..first + 27).contains(&row) { FREE } else { 0 };
+    assert!(restored.guide_of.into_iter().eq((0..field.len()).map(of)));
 }
 
 /// A capture of one camera that jumps, in which a rod as thin as two pixels that turns and travels is in the place of the

@@ -17,6 +17,7 @@ use crate::config::ObjectMotion;
 use crate::effects::appearing::Posed;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
+use crate::losses::displacement::FREE;
 use crate::objects::{self, BENDS_NO_BETTER, Bending, Fitted, Found, Order, Plane, Surroundings};
 use crate::phase::Phase;
 use crate::schedule::log_linear;
@@ -398,13 +399,16 @@ impl Trainer {
         first
     }
 
-    /// Adds the Gaussians of an object that deforms to the field, which the network moves; returns the row of the first.
+    /// Adds the Gaussians of an object that deforms to the field, which the network moves and nothing holds; returns the row
+    /// of the first.
     fn add_deforming(&mut self, found: &Bending) -> usize {
         let mut rows = found.gaussians.clone();
         for mean in &mut rows.means {
             *mean = (DVec3::from_array(mean.map(f64::from)) + found.place).as_vec3().to_array();
         }
-        self.append(rows)
+        let first = self.append(rows);
+        self.state.guidance.extend(first, found.gaussians.len(), FREE);
+        first
     }
 
     /// Rate of the poses at a step of a stage; 0 where they stay.

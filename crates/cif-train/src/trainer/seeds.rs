@@ -104,11 +104,9 @@ impl Trainer {
         let mut fresh = Gaussians::from_points(&positions, &colors)?;
         fresh.opacity_logits.fill(logit(OPACITY));
         let first = self.append(fresh);
-        // Objects with poses came in between, which no path holds.
         let State { field, guidance, .. } = &mut self.state;
-        guidance.guide_of.resize(first, 0);
         guidance.guides.push(Guide { track, reference });
-        guidance.guide_of.resize(field.len(), guidance.guides.len() as u16);
+        guidance.extend(first, field.len() - first, guidance.guides.len() as u16);
         Ok(())
     }
 

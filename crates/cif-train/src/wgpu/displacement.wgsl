@@ -19,7 +19,7 @@ struct Guide {
 @group(0) @binding(0) var<uniform> motion: Motion;
 @group(0) @binding(1) var<storage, read> posed: array<vec4f>;
 @group(0) @binding(2) var<storage, read> canonical: array<vec4f>;
-// Object + 1 per Gaussian, 0 for what is held in place.
+// Object + 1 per Gaussian, 0 for what is held in place, FREE for what nothing holds.
 @group(0) @binding(3) var<storage, read> guide_of: array<u32>;
 // How far each object is from its canonical place.
 @group(0) @binding(4) var<storage, read> shifts: array<vec4f>;
@@ -124,7 +124,7 @@ fn follow(
 @compute @workgroup_size(128)
 fn displace(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) local: u32) {
     let row = (group.y * MAX_WORKGROUPS + group.x) * 128u + local;
-    if row >= motion.gaussians {
+    if row >= motion.gaussians || guide_of[row] == FREE {
         return;
     }
     let displaced = posed[3u * row].xyz;

@@ -18,7 +18,7 @@ pub use cif_render::wgpu::faults as fault;
 
 use crate::adam::{BETA_1, BETA_2, EPSILON};
 use crate::exposure::WIDTH as EXPOSURE_FLOATS;
-use crate::losses::displacement::NO_ROTATION;
+use crate::losses::displacement::{FREE, NO_ROTATION};
 use crate::losses::held_out;
 use crate::losses::ssim::{C1, C2};
 use crate::poses;
@@ -285,6 +285,7 @@ const CONSTANTS: Snippet = Snippet {
             ("INSTANCE_PASS", Constant::Unsigned(INSTANCE_PASS)),
             ("SSIM_C1", Constant::Float(C1)),
             ("SSIM_C2", Constant::Float(C2)),
+            ("FREE", Constant::Unsigned(u32::from(FREE))),
             ("NO_ROTATION", Constant::Float(NO_ROTATION as f32)),
             ("SH_FLOATS", Constant::Unsigned(SH_FLOATS as u32)),
             ("GEOMETRY_FLOATS", Constant::Unsigned(GEOMETRY_FLOATS as u32)),

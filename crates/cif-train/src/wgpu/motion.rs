@@ -36,7 +36,7 @@ impl GpuMotion {
         })
     }
 
-    /// Sends the guide of every Gaussian (0 for what is held in place); none switches everything off.
+    /// Sends the guide of every Gaussian (0 for what is held in place, `FREE` for what nothing holds); none switches everything off.
     ///
     /// # Errors
     /// When they exceed what the device binds.
