@@ -72,3 +72,28 @@ mod tests {
         assert!(work > 0.0 && spent.wall_s > 0.0 && spent.cpu_s >= 0.0, "{spent:?}");
     }
 }
+
+#[cfg(test)]
+pub(crate) mod testing {
+    use std::sync::Mutex;
+
+    use super::{Clock, Seconds};
+
+    /// A clock that stands still until time passes on it; two processors are busy.
+    #[derive(Default)]
+    pub(crate) struct Manual(Mutex<f64>);
+
+    impl Manual {
+        /// So many seconds pass.
+        pub(crate) fn pass(&self, seconds: f64) {
+            *self.0.lock().unwrap() += seconds;
+        }
+    }
+
+    impl Clock for Manual {
+        fn now(&self) -> Seconds {
+            let wall_s = *self.0.lock().unwrap();
+            Seconds { wall_s, cpu_s: 2.0 * wall_s }
+        }
+    }
+}

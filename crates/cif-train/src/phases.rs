@@ -344,23 +344,7 @@ impl Drop for Entered {
 mod tests {
     use super::*;
     use crate::budget::BudgetClock;
-
-    /// A clock that stands still until time passes on it.
-    #[derive(Default)]
-    struct Manual(Mutex<f64>);
-
-    impl Manual {
-        fn pass(&self, seconds: f64) {
-            *self.0.lock().unwrap() += seconds;
-        }
-    }
-
-    impl Clock for Manual {
-        fn now(&self) -> Seconds {
-            let wall_s = *self.0.lock().unwrap();
-            Seconds { wall_s, cpu_s: 2.0 * wall_s }
-        }
-    }
+    use crate::clock::testing::Manual;
 
     fn on_a_clock() -> (Arc<Manual>, Phases) {
         let clock = Arc::new(Manual::default());

@@ -3,7 +3,7 @@
 use cif_dataset::{Dataset, Split};
 
 use super::Calibration;
-use crate::budget::{COARSE, IDENTITY_STEPS_PER_FRAME, INSTANCE, PIXELS_OF_FIT, TRAVELS};
+use crate::budget::{COARSE, IDENTITY_STEPS_PER_FRAME, INSTANCE, PIXELS_OF_FIT, fits_of_resting};
 use crate::config::{DensifyRule, TrainConfig};
 use crate::density::growth;
 use crate::detail::MOST;
@@ -14,9 +14,6 @@ use crate::working_size;
 /// Time of one view of those that additions of Gaussians are decided by, in fine steps: it is rendered, and sums over its
 /// pixels go back to the Gaussians. These parts of a step are 0.45 of it on two captures.
 const STEPS_OF_VIEW: f64 = 0.45;
-
-/// Time of looking for joints of an object that does not travel, in fits of one that does: 0.4 to 1.4 on three captures.
-const JOINTS: f64 = 0.5;
 
 /// Time of all fine steps with the tests of what effects are worth over that without: 1.04 to 1.06 on ten runs.
 const TESTS: f64 = 1.05;
@@ -103,7 +100,7 @@ impl Expected {
     ) -> Result<Self, TrainError> {
         let [width, height] = calibration.image_size.map(f64::from);
         let pixel_s = calibration.shares.pixels * calibration.step_s / (width * height).max(1.0);
-        let of_resting = 1.0 / TRAVELS + if config.motion.parts { JOINTS } else { 0.0 };
+        let of_resting = fits_of_resting(config.motion.parts);
         let objects = work.travelling as f64 + work.resting as f64 * of_resting;
         let fits = if work.has_fits(config) { objects } else { 0.0 };
         Ok(Self {
@@ -311,10 +308,11 @@ mod tests {
         assert!((of(&config, WORK).fits_s / (2.0 * fit) - 1.0).abs() < 1e-9);
         let others = Workload { travelling: 1, resting: 7, ..WORK };
         config.motion.parts = false;
-        assert!((of(&config, others).fits_s / (fit + 7.0 * fit / TRAVELS) - 1.0).abs() < 1e-9);
+        assert!((of(&config, others).fits_s / (fit + 7.0 * fits_of_resting(false) * fit) - 1.0).abs() < 1e-9);
         config.motion.parts = true;
-        let joints = 7.0 * (JOINTS + 1.0 / TRAVELS);
-        assert!((of(&config, others).fits_s / (fit + joints * fit) - 1.0).abs() < 1e-9);
+        assert!(fits_of_resting(true) > fits_of_resting(false));
+        let resting = 7.0 * fits_of_resting(true);
+        assert!((of(&config, others).fits_s / (fit + resting * fit) - 1.0).abs() < 1e-9);
         assert_eq!(of(&config, WORK).gaussians, 10_000);
         let many = of(&config, Workload { frames: 1_040, ..WORK });
         let more = many.memory_bytes - of(&config, WORK).memory_bytes;

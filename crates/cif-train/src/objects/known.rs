@@ -79,11 +79,6 @@ impl KnownObjects {
         }
     }
 
-    /// Number of objects that move as a whole.
-    pub(crate) fn moving_count(&self) -> usize {
-        self.rigid.values().filter(|found| matches!(found, Found::Moves(_))).count()
-    }
-
     /// Sets of Gaussians, each under its name.
     fn sets(&mut self) -> Vec<(String, &mut Gaussians)> {
         let mut sets = Vec::new();

@@ -5,7 +5,7 @@ use cif_field::tracks::NO_GROUP;
 
 use super::Trainer;
 use super::cost::Load;
-use crate::budget::{IDENTITY_STEPS_PER_FRAME, INSTANCE, MOVING, PIXELS_OF_FIT, TRAVELS};
+use crate::budget::{IDENTITY_STEPS_PER_FRAME, INSTANCE, MOVING, PIXELS_OF_FIT, fits_of_resting};
 use crate::config::DensifyRule;
 use crate::density::growth;
 use crate::phase::Phase;
@@ -150,12 +150,11 @@ impl Trainer {
     /// Estimated seconds of the fits to come, by those of objects that were tried before, or by the steps of the coarse
     /// stage where none was.
     fn fits_s(&self) -> f64 {
-        let others = self.state.guidance.travelling.iter().skip(1).filter(|travels| !**travels).count();
-        // In units of fits of objects that rest.
-        let tried = others as f64 + TRAVELS * self.state.objects.moving_count() as f64;
-        let spent = self.state.phases.spent(Phase::Search).wall_s;
-        let objects = self.objects_to_fit() as f64;
-        if tried > 0.0 { TRAVELS * objects * spent / tried } else { objects * PIXELS_OF_FIT * self.pixel_s() }
+        let tried = self.state.objects.rigid.len() as f64 * fits_of_resting(self.state.config.motion.parts);
+        let spent = |phase| self.state.phases.spent(phase).wall_s;
+        let of_tried = spent(Phase::Search) + spent(Phase::Joints);
+        let fit_s = if tried > 0.0 { of_tried / tried } else { PIXELS_OF_FIT * self.pixel_s() };
+        self.objects_to_fit() as f64 * fit_s
     }
 
     /// Seconds that the coarse steps took for each pixel of their images; 0 where their parts were not timed.
@@ -171,11 +170,17 @@ impl Trainer {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
     use std::time::Duration;
+
+    use cif_field::Gaussians;
 
     use super::super::cost::Reports;
     use super::super::guard_tests::support::{Scene, capture, small_config};
+    use super::super::guidance_tests::explained;
     use super::*;
+    use crate::clock::testing::Manual;
+    use crate::objects::Found;
     use crate::times::{StepTimes, raster_cost};
     use crate::working_size::PIXEL_SHARE;
 
@@ -197,6 +202,21 @@ mod tests {
         trainer.state.times.losses = Duration::from_secs_f64(10.0 * pixels * 20e-9);
         let fits_s = trainer.fits_s();
         assert!((fits_s / (2.0 * PIXELS_OF_FIT * 20e-9) - 1.0).abs() < 1e-3, "{fits_s}");
+        // Four others took 12 and 9 seconds, and two of them were found to move in place.
+        let clock = Arc::new(Manual::default());
+        trainer.state.phases.set_clock(clock.clone());
+        for (phase, seconds) in [(Phase::Search, 12.0), (Phase::Joints, 9.0)] {
+            let _entered = trainer.state.phases.enter(phase, 4);
+            clock.pass(seconds);
+        }
+        trainer.state.guidance.travelling = vec![false, true, true, true, true, false, false];
+        trainer.state.objects.rigid = [5, 6].map(|label| (label, Found::Nothing)).into();
+        let found = explained(Gaussians::from_points(&[[0.0; 3]], &[[0.5; 3]]).unwrap());
+        let moves = [3, 4].map(|label| (label, Found::Moves(Box::new(found.clone()))));
+        trainer.state.objects.rigid.extend(moves);
+        let expected = 2.0 * 21.0 / (4.0 * fits_of_resting(true));
+        let fits_s = trainer.fits_s();
+        assert!((fits_s / expected - 1.0).abs() < 1e-9, "{fits_s} {expected}");
     }
 
     #[test]

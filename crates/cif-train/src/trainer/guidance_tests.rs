@@ -17,7 +17,7 @@ use crate::objects::{Bending, Fitted, Found};
 use crate::stage::Stage;
 
 /// An object without poses yet, which is explained in full.
-fn explained(gaussians: Gaussians) -> Fitted {
+pub(super) fn explained(gaussians: Gaussians) -> Fitted {
     Fitted {
         poses: BTreeMap::new(),
         shares: BTreeMap::new(),
