@@ -189,7 +189,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let dataset = capture(folder.path(), Scene { times: 3, views: 4, ..Scene::default() });
         let mut config = small_config();
-        (config.motion.rigid, config.motion.guidance) = (true, 1.0);
+        (config.motion.rigid, config.motion.parts, config.motion.guidance) = (true, true, 1.0);
         let mut trainer = Trainer::new(dataset, config).unwrap();
         assert_eq!(trainer.fits_s(), 0.0, "nothing travels");
         trainer.state.guidance.travelling = vec![false, true, true];
