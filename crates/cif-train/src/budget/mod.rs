@@ -8,7 +8,7 @@ use crate::clock::Seconds;
 
 pub use pacer::{COARSE, INSTANCE, OtherWork, Pacer, Part, StageShare, StepCosts};
 pub(crate) use pacer::{
-    FITS, IDENTITY_STEPS_PER_FRAME, MOVING, PIXELS_OF_FIT, REHEARSAL, TRIALS, fits_of_resting, weights,
+    FITS, MOVING, PIXELS_OF_FIT, REHEARSAL, STEPS_OF_IDENTITY_VIEW, TRIALS, fits_of_resting, weights,
 };
 
 /// Which time a budget counts.

@@ -3,12 +3,12 @@
 use cif_dataset::{Dataset, Split};
 
 use super::Calibration;
-use crate::budget::{COARSE, IDENTITY_STEPS_PER_FRAME, INSTANCE, PIXELS_OF_FIT, fits_of_resting};
+use crate::budget::{COARSE, INSTANCE, PIXELS_OF_FIT, STEPS_OF_IDENTITY_VIEW, fits_of_resting};
 use crate::config::{DensifyRule, TrainConfig};
 use crate::density::growth;
 use crate::detail::MOST;
 use crate::error::TrainError;
-use crate::trainer::{deformation_shape, memory_of_gaussians, memory_of_planes};
+use crate::trainer::{deformation_shape, identity_views, memory_of_gaussians, memory_of_planes};
 use crate::working_size;
 
 /// Time of one view of those that additions of Gaussians are decided by, in fine steps: it is rendered, and sums over its
@@ -142,8 +142,8 @@ pub(super) fn steps_s(
         + STEPS_OF_VIEW * f64::from(views_of_additions(config)) * middle;
     let coarse = f64::from(config.stages.coarse) * few * if work.is_dynamic { COARSE } else { 1.0 };
     let full = calibration.step_s(most, reduction * working);
-    let of_instances =
-        f64::from(config.stages.instance) * INSTANCE + IDENTITY_STEPS_PER_FRAME * work.frames as f64;
+    let identity_views = identity_views(config, work.frames).iter().sum::<usize>() as f64;
+    let of_instances = f64::from(config.stages.instance) * INSTANCE + STEPS_OF_IDENTITY_VIEW * identity_views;
     coarse + fine + if work.has_instances { of_instances * full } else { 0.0 }
 }
 
@@ -262,7 +262,7 @@ mod tests {
         assert!((unknown / (200.0 * more) - 1.0).abs() < 1e-6, "{unknown}");
         // Identities are estimated over all frames; coarse steps have the Gaussians of the beginning.
         let identity = steps_s(&config, &MEASURED, WORK, 1) - seconds - known;
-        assert!((identity / (40.0 * IDENTITY_STEPS_PER_FRAME * 0.01) - 1.0).abs() < 1e-6, "{identity}");
+        assert!((identity / (40.0 * STEPS_OF_IDENTITY_VIEW * 0.01) - 1.0).abs() < 1e-6, "{identity}");
         config.stages.coarse = 100;
         let coarse = steps_s(&config, &MEASURED, still, 1) - seconds - known;
         let step = COARSE * 0.01 * (0.5 * raster_cost(1.0, 0.2) + 0.1 + 0.4 * 0.2);

@@ -15,9 +15,6 @@ use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::phase::Phase;
 
-/// Views that are looked at, spread evenly.
-const VIEWS: usize = 100;
-
 /// Share of its image on labelled pixels that is left to a Gaussian of no instance.
 const LIMIT: f32 = 1e-3;
 
@@ -87,8 +84,7 @@ impl Trainer {
     fn votes(&self, of: &[Option<u16>]) -> Result<Vec<Votes>, TrainError> {
         let state = &self.state;
         let mut votes = vec![Votes::default(); of.len()];
-        let all: Vec<usize> = state.views_of_identities().collect();
-        let views: Vec<usize> = all.iter().copied().step_by(all.len().div_ceil(VIEWS).max(1)).collect();
+        let views = self.views_held_against();
         let _phase = state.phases.enter(Phase::Identity, views.len());
         let masks = state.frames.masks(&state.dataset, &state.phases)?;
         let gaussians = &state.field.gaussians;

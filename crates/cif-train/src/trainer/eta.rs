@@ -5,7 +5,7 @@ use cif_field::tracks::NO_GROUP;
 
 use super::Trainer;
 use super::cost::Load;
-use crate::budget::{IDENTITY_STEPS_PER_FRAME, INSTANCE, MOVING, PIXELS_OF_FIT, fits_of_resting};
+use crate::budget::{INSTANCE, MOVING, PIXELS_OF_FIT, STEPS_OF_IDENTITY_VIEW, fits_of_resting};
 use crate::config::DensifyRule;
 use crate::density::growth;
 use crate::phase::Phase;
@@ -27,7 +27,7 @@ impl Trainer {
     }
 
     /// Estimated seconds to the end of the run: the budget's where there is one, else by steps that cost what the last ones
-    /// did, by the frames that identities are estimated from, and by the objects that are fitted between the coarse and the
+    /// did, by the views that identities are worked out from, and by the objects that are fitted between the coarse and the
     /// fine stage.
     pub(super) fn eta_s(&self, stage: Stage) -> f64 {
         if let Some(left_s) = self.budget_left_s() {
@@ -54,8 +54,8 @@ impl Trainer {
                 .sum::<f64>()
         };
         let stages = [Stage::Coarse, Stage::Fine, Stage::Instance].into_iter().filter(|of| *of >= stage);
-        let identity_s = IDENTITY_STEPS_PER_FRAME
-            * self.frames_of_identities(stage) as f64
+        let identity_s = STEPS_OF_IDENTITY_VIEW
+            * self.identity_views(stage) as f64
             * step_s(Stage::Instance, all(Stage::Instance));
         let fits_s = if stage == Stage::Coarse { self.fits_s() } else { 0.0 };
         stages.map(left_s).sum::<f64>() + identity_s + fits_s
@@ -247,7 +247,7 @@ mod tests {
         trainer.reports.add(0.0, times, 0, &step(0.25));
         trainer.reports.add(10.0, times, 10, &step(0.25));
         let cost = |pixels: f64| PIXEL_SHARE * raster_cost(4.0 * pixels, 1.0) + 1.0 - PIXEL_SHARE;
-        let identity = IDENTITY_STEPS_PER_FRAME * trainer.frames_of_identities(Stage::Fine) as f64;
+        let identity = STEPS_OF_IDENTITY_VIEW * trainer.identity_views(Stage::Fine) as f64;
         let expected = 40.0 + (40.0 + INSTANCE * identity) * cost(1.0) + 20.0 * cost(4.0);
         let eta_s = trainer.eta_s(Stage::Fine);
         assert!((eta_s / expected - 1.0).abs() < 1e-6, "{eta_s} {expected}");

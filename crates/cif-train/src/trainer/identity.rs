@@ -5,13 +5,33 @@ use cif_geometry::scalar::{logit, sigmoid};
 use cif_render::Gradients;
 
 use super::Trainer;
-use crate::config::{Ablation, OccupancyStart};
+use crate::config::{Ablation, HeadName, OccupancyStart, TrainConfig};
 use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::estimate::{RowSource, estimate};
 use crate::events::TrainEvent;
 
+/// Most views that identities are held against behind the instance stage, spread evenly.
+const HELD_AGAINST: usize = 100;
+
+/// Views that identities are estimated from, of so many training views, and those that they are held against behind the
+/// instance stage, each as often as that is done: once for what masks contradict, and in every round of shares.
+pub(crate) fn identity_views(config: &TrainConfig, views: usize) -> [usize; 2] {
+    let all = views.div_ceil(config.identity.stride.max(1) as usize);
+    let rounds = match config.head.name {
+        HeadName::Cif if config.stages.instance > 0 => 1 + config.identity.share_rounds as usize,
+        _ => 0,
+    };
+    [all, rounds * all.div_ceil(all.div_ceil(HELD_AGAINST).max(1))]
+}
+
 impl Trainer {
+    /// Views that identities are held against behind the instance stage.
+    pub(super) fn views_held_against(&self) -> Vec<usize> {
+        let all: Vec<usize> = self.state.views_of_identities().collect();
+        all.iter().copied().step_by(all.len().div_ceil(HELD_AGAINST).max(1)).collect()
+    }
+
     /// Estimates the rows of all Gaussians; `starts` also sets occupancy to where the instance stage begins.
     pub(super) fn estimate_identities(&mut self, starts: bool) -> Result<TrainEvent, TrainError> {
         let k = self.state.field.instances.len();

@@ -84,6 +84,7 @@ use cif_render::cpu::SimdLevel;
 #[cfg(feature = "wgpu")]
 pub use self::backend::Probe;
 use self::cost::Reports;
+pub(crate) use self::identity::identity_views;
 pub(crate) use self::initialize::{
     automatic_time_nodes, deformation_shape, memory_of_gaussians, memory_of_planes,
 };

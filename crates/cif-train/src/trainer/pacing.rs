@@ -7,6 +7,7 @@
 use serde_json::{Value, json};
 
 use super::Trainer;
+use super::identity::identity_views;
 use super::pace::{Pacing, Shares};
 use crate::budget::{Budget, FITS, OtherWork, Pacer, REHEARSAL, StepCosts, TRIALS, weights};
 use crate::curve::{CurvePoint, Targets};
@@ -81,7 +82,7 @@ impl Trainer {
             .filter(|(other, steps, _)| *steps > 0 || *other == stage)
             .collect();
         let other = OtherWork {
-            identity_frames: self.frames_of_identities(stage),
+            identity_views: self.identity_views(stage),
             has_fits: stage == Stage::Coarse && self.objects_to_fit() > 0,
         };
         let now = self.state.phases.now();
@@ -103,10 +104,13 @@ impl Trainer {
         }
     }
 
-    /// Frames that identity estimation passes over behind a stage.
-    pub(super) fn frames_of_identities(&self, stage: Stage) -> usize {
-        let comes = self.stages.has_instances && stage < Stage::Identity;
-        if comes { self.state.views_of_identities().count() } else { 0 }
+    /// Views that identities will still be worked out from in a stage, or behind it.
+    pub(super) fn identity_views(&self, stage: Stage) -> usize {
+        if !self.stages.has_instances {
+            return 0;
+        }
+        let [before, behind] = identity_views(&self.state.config, self.state.frames.len());
+        behind + if stage < Stage::Identity { before } else { 0 }
     }
 
     /// Time by which fits have to be done that a budget can do without.

@@ -16,9 +16,6 @@ use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::phase::Phase;
 
-/// Views that are looked at in each round, spread evenly.
-const VIEWS: usize = 100;
-
 /// Shares are kept this far from 0 and 1, where no evidence moves them any more.
 const LIMIT: f32 = 1e-3;
 
@@ -38,8 +35,7 @@ impl Trainer {
         };
         let before = identities.labelled_shares();
         let mut shares: Vec<f32> = before.iter().map(|share| share.clamp(LIMIT, 1.0 - LIMIT)).collect();
-        let all: Vec<usize> = self.state.views_of_identities().collect();
-        let views: Vec<usize> = all.iter().copied().step_by(all.len().div_ceil(VIEWS).max(1)).collect();
+        let views = self.views_held_against();
         let _phase = self.state.phases.enter(Phase::Identity, rounds as usize * views.len());
         let mut renderer = Renderer::new(SimdLevel::Auto);
         for _ in 0..rounds {
