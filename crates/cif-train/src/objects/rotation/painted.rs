@@ -148,6 +148,17 @@ impl Turned {
         let (low, high) = self.angles.iter().fold((f64::INFINITY, f64::NEG_INFINITY), ends);
         high - low
     }
+
+    /// The place of the time at which half of the way is behind.
+    fn middle(&self) -> usize {
+        let turns = || self.angles.windows(2).map(|pair| (pair[1] - pair[0]).abs());
+        let half = 0.5 * turns().sum::<f64>();
+        let behind = turns().scan(0.0, |way, turn| {
+            *way += turn;
+            Some(*way)
+        });
+        1 + behind.take_while(|way| *way < half).count()
+    }
 }
 
 impl Seen {
@@ -260,13 +271,34 @@ impl Seen {
     /// Residuals of all pixels that are left out, by the layered model.
     pub(super) fn residuals(&self, evidence: &Evidence<'_>, turned: &Turned, turns: bool) -> Vec<f32> {
         let painted = self.painted(turned.axis);
+        let cell = |k: usize, time: usize| painted.cell(k, turned.angles[time]);
+        self.layered(evidence, &painted, (painted.cells, cell), turns)
+    }
+
+    /// The same where nothing turns about an axis, but all of it looks another way from the middle of the way of turns on, as
+    /// where a shadow falls on it.
+    pub(super) fn changed(&self, evidence: &Evidence<'_>, turned: &Turned) -> Vec<f32> {
+        let painted = self.painted(turned.axis);
+        let middle = turned.middle();
+        let cell = |k: usize, time: usize| 2 * painted.cell(k, 0.0) + usize::from(time >= middle);
+        self.layered(evidence, &painted, (2 * painted.cells, cell), true)
+    }
+
+    /// Residuals with paint in so many cells: that of a place at the place of a time.
+    fn layered(
+        &self,
+        evidence: &Evidence<'_>,
+        painted: &Painted<'_>,
+        (count, cell): (usize, impl Fn(usize, usize) -> usize),
+        turns: bool,
+    ) -> Vec<f32> {
         let mut paint = vec![None; evidence.len()];
         let mut light = vec![None; evidence.len()];
         for (k, spot) in self.spots.iter().enumerate() {
-            paint[spot.pixel] = Some(painted.cell(k, turned.angles[self.time_of[spot.look]]) as u32);
+            paint[spot.pixel] = Some(cell(k, self.time_of[spot.look]) as u32);
             light[spot.pixel] = Some(painted.light(k) as u32);
         }
-        let paint = LayerCells { of_pixel: paint, count: painted.cells };
+        let paint = LayerCells { of_pixel: paint, count };
         let light = LayerCells { of_pixel: light, count: painted.lights() };
         layered(evidence, &paint, &light, turns)
     }

@@ -13,9 +13,9 @@ use super::painted::{Cells, Seen, Spot, Turned, Turning, mean};
 const PIXELS: usize = 400;
 
 /// Turns of paint, of the angle by which a camera goes around, that a surface at rest seems to have where it is modelled at
-/// another depth than its own: `1 - r / R` of paint at a radius `r` where `R` is modelled, from the far wall that an opening
-/// shows (2) to a model of half the size (-1).
-const SLIDES: [f64; 6] = [-1.0, -0.5, 0.5, 1.0, 1.5, 2.0];
+/// another depth than its own: `1 - r / R` of paint at a radius `r` where `R` is modelled, from a model of half the size (-10
+/// tenths) to the far wall that an opening shows (20). A tenth of the way of a camera is about the width of a cell of paint.
+const SLIDES: std::ops::RangeInclusive<i32> = -10..=20;
 
 /// Places of a surface that pixels show, and how well they are explained where nothing turns.
 pub(super) struct Shown {
@@ -65,18 +65,19 @@ impl Shown {
         if is_shown { Some([mean(&residuals)?, self.few.error]) } else { None }
     }
 
-    /// True where a surface that is not known exactly has the turns that were found, and no paint slides over it instead as
-    /// the camera travels: turns that each half of the surface shows explain the other half better than any of this does.
+    /// True where a surface that is not known exactly has the turns that were found, and neither does paint slide over it
+    /// instead as the camera travels, nor all of it look another way from some time on: turns that each half of the surface
+    /// shows explain the other half better than any of this does.
     pub(super) fn turns(&self, evidence: &Evidence<'_>, found: &Turned) -> bool {
         let crossed = self.crossed(evidence, found.axis);
         let sides = self.all.sides(found.axis);
-        let slid = |share: f64| {
-            let angles = sides.iter().map(|side| share * side).collect();
+        let slid = |tenths: i32| {
+            let angles = sides.iter().map(|side| 0.1 * f64::from(tenths) * side).collect();
             self.all.residuals(evidence, &Turned { axis: found.axis, angles, cost: 0.0 }, true)
         };
-        let likest = slope(&sides, &found.angles).clamp(SLIDES[0], SLIDES[SLIDES.len() - 1]);
         beats(evidence, &crossed, &self.still)
-            && SLIDES.into_par_iter().chain([likest]).all(|share| beats(evidence, &crossed, &slid(share)))
+            && beats(evidence, &crossed, &self.all.changed(evidence, found))
+            && SLIDES.into_par_iter().all(|tenths| beats(evidence, &crossed, &slid(tenths)))
     }
 
     /// Residuals of the pixels of each half of the surface, above and below the middle of the axis, with the turns that the
@@ -101,13 +102,4 @@ impl Shown {
 /// True where residuals are less than others by more than chance.
 fn beats(evidence: &Evidence<'_>, residuals: &[f32], others: &[f32]) -> bool {
     standard_errors(&gains(evidence, residuals, others)) > SIGMAS
-}
-
-/// The factor by which numbers are most like others, up to an offset.
-fn slope(from: &[f64], to: &[f64]) -> f64 {
-    let middle = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
-    let (from_middle, to_middle) = (middle(from), middle(to));
-    let pairs = || from.iter().zip(to).map(|(a, b)| (a - from_middle, b - to_middle));
-    let (both, own): (f64, f64) = pairs().fold((0.0, 0.0), |(both, own), (a, b)| (both + a * b, own + a * a));
-    both / own.max(1e-9)
 }

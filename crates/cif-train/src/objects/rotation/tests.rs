@@ -79,9 +79,9 @@ fn what_stays_is_not_seen_to_turn() {
 }
 
 /// Turns about the upright axis of a ball that is modelled with some radius: are they shown, and are they its own.
-fn shown_turns(degrees: f64, radius: f64, cameras: Cameras) -> [bool; 2] {
+fn shown_turns(turns: Course, radius: f64, cameras: Cameras) -> [bool; 2] {
     let ball = solid(&sphere_places(RADIUS), patches, 0.007);
-    let seen = views(ball, &poses(&course(degrees, DVec3::Z, stays)), cameras);
+    let seen = views(ball, &poses(&turns), cameras);
     let evidence = Evidence::of(seen.iter()).unwrap();
     let ball = Ball { centre: stays(0), radius };
     let place =
@@ -94,8 +94,20 @@ fn shown_turns(degrees: f64, radius: f64, cameras: Cameras) -> [bool; 2] {
 #[test]
 fn paint_that_slides_over_a_surface_at_another_depth_is_no_turn() {
     let around = |time: usize| vec![camera(3.0 * share(time))];
-    assert_eq!(shown_turns(0.0, 1.5 * RADIUS, around), [true, false]);
-    assert_eq!(shown_turns(-200.0, RADIUS, moving), [true, true]);
+    let turning = |degrees: f64| course(degrees, DVec3::Z, stays);
+    for larger in [1.35, 1.5, 1.8] {
+        assert_eq!(shown_turns(turning(0.0), larger * RADIUS, around), [true, false], "{larger}");
+    }
+    assert_eq!(shown_turns(turning(-200.0), RADIUS, moving), [true, true]);
+}
+
+#[test]
+fn what_looks_another_way_from_some_time_on_may_not_have_turned() {
+    let mut turns = course(0.0, DVec3::Z, stays);
+    for pose in turns.values_mut().skip(TIMES / 2) {
+        pose.rotation = DQuat::from_rotation_z(PI / 2.0);
+    }
+    assert_eq!(shown_turns(turns, RADIUS, moving), [true, false]);
 }
 
 #[test]
