@@ -39,9 +39,10 @@ const AROUND: [f64; 2] = [1.15, 1.35];
 const STAND: f64 = 1.0 / 3.0;
 
 /// Distance of the middle of discs from that of the ball, and difference of their radii, pixels and of the radius, up to
-/// which they agree. Of six rendered balls on stands nearly all discs do that show them whole, of other things of ten
-/// rendered captures at most half, but for a box of which three quarters do.
+/// which they agree, and the share of those that show it whole which must. Of six rendered balls on stands all do, of other
+/// things of eleven rendered captures at most 0.81.
 const OFF: [f64; 2] = [0.1, 0.03];
+const AGREEING: f64 = 0.9;
 
 /// Share of the masks that the ball has at most: what is a ball as a whole has no stand.
 const MOST: f64 = 0.9;
@@ -83,8 +84,10 @@ pub(super) fn ball<'a>(views: impl Iterator<Item = &'a ObjectView>) -> Option<Ba
         |seen: &&&(&'a ObjectView, Disc)| (size(seen) - radius).abs() < most_off(&seen.1) * radius;
     let agreeing: Vec<&Disc> = there.iter().filter(is_as_large).map(|seen| &seen.1).collect();
     let middle = |of: fn(&Disc) -> f64| median(&mut agreeing.iter().map(|disc| of(disc)).collect::<Vec<_>>());
-    let is_whole = |seen: &&(&'a ObjectView, Disc)| shows_whole(camera(seen.0), &ball);
-    let are_most = agreeing.len() >= FEWEST && 2 * agreeing.len() > discs.iter().filter(is_whole).count();
+    // In the image: a crop follows what is elsewhere.
+    let is_whole = |seen: &&(&ObjectView, Disc)| shows_whole(&seen.0.camera, &ball);
+    let whole = discs.iter().filter(is_whole).count();
+    let are_most = agreeing.len() >= FEWEST && agreeing.len() as f64 > AGREEING * whole as f64;
     let stands = middle(|disc| disc.around) < STAND && middle(|disc| disc.share) < MOST;
     (are_most && stands).then_some(ball)
 }
@@ -94,7 +97,7 @@ fn most_off(disc: &Disc) -> f64 {
     OFF[0] / disc.radius + OFF[1]
 }
 
-/// True where a ball lies within a crop.
+/// True where a ball lies within an image.
 fn shows_whole(camera: &PinholeCamera, ball: &Ball) -> bool {
     camera.project(ball.centre).is_some_and(|(pixel, depth)| {
         let reach = DVec2::splat(ball.radius / depth * camera.focal_px.x);

@@ -173,6 +173,17 @@ const CENTRE: DVec3 = DVec3::new(0.0, 0.0, 0.1);
 
 /// Views of a ball of some colours that turns on its stand, about an axis.
 fn globe(axis: DVec3, degrees: f64, color: fn(DVec3) -> [f32; 3], cameras: Cameras) -> Vec<ObjectView> {
+    globe_at(|_| DVec3::ZERO, axis, degrees, color, cameras)
+}
+
+/// The same where its stand is at places by time.
+fn globe_at(
+    place: impl Fn(usize) -> DVec3,
+    axis: DVec3,
+    degrees: f64,
+    color: fn(DVec3) -> [f32; 3],
+    cameras: Cameras,
+) -> Vec<ObjectView> {
     let stand = faces(DVec3::new(-0.03, -0.03, 0.0), DVec3::new(0.03, 0.03, 0.02), 500, 25);
     let pole = faces(DVec3::new(-0.006, -0.006, 0.02), DVec3::new(0.006, 0.006, 0.06), 200, 26);
     let base: Vec<DVec3> = stand.into_iter().chain(pole).collect();
@@ -181,13 +192,23 @@ fn globe(axis: DVec3, degrees: f64, color: fn(DVec3) -> [f32; 3], cameras: Camer
     let turned = solid(&ball, |place| color(place - CENTRE), 0.006);
     all.append(&turned);
     let group_of = (0..all.len()).map(|row| u32::from(row >= base.len())).collect();
-    let still = vec![(DQuat::IDENTITY, DVec3::ZERO); TIMES];
+    let still = (0..TIMES).map(|time| (DQuat::IDENTITY, place(time))).collect();
     let pose = |time: usize| {
         let turn = DQuat::from_axis_angle(axis, degrees.to_radians() * share(time));
-        (turn, CENTRE - turn * CENTRE)
+        (turn, place(time) + CENTRE - turn * CENTRE)
     };
     let poses = (0..TIMES).map(pose).collect();
     views_of_groups(all, group_of, &[still, poses], cameras)
+}
+
+#[test]
+fn what_is_carried_elsewhere_is_no_ball_on_a_stand_at_rest() {
+    let seen = |away: f64| {
+        let place = |time: usize| if share(time) < 0.7 { DVec3::ZERO } else { away * DVec3::X };
+        discs::ball(globe_at(place, DVec3::Z, 160.0, patches, moving).iter())
+    };
+    assert!(seen(0.0).is_some_and(|ball| ball.centre.distance(CENTRE) < 0.01));
+    assert!(seen(0.1).is_none());
 }
 
 fn turning(views: &[ObjectView]) -> Option<Jointed> {
