@@ -35,14 +35,17 @@ impl Load {
     }
 }
 
-/// The steps of a run so far, at a report.
+/// Steps from one report to the next.
 #[derive(Clone, Copy, Debug, Default)]
 struct Report {
-    /// Seconds of all steps, with what passed between them.
+    /// Seconds of all steps of the run at its end.
     at_s: f64,
-    /// Times of their parts.
-    times: StepTimes,
+    /// Seconds of these steps, with what passed between them, and of their parts.
+    seconds: f64,
+    parts: [f64; 4],
     work: Work,
+    /// False for the first steps of a stage, which take memory: they show what no other step costs.
+    is_typical: bool,
 }
 
 /// Sums over steps.
@@ -57,46 +60,59 @@ struct Work {
 
 /// Reports of a run, the last ones of which show what a step costs.
 #[derive(Debug, Default)]
-pub(super) struct Reports(VecDeque<Report>);
+pub(super) struct Reports {
+    reports: VecDeque<Report>,
+    /// Seconds of all steps at the last report, and of their parts.
+    last: Option<(f64, [f64; 4])>,
+}
 
 impl Reports {
     /// Adds `steps` that were done since the last report, each of which worked on `load`: `at_s` seconds and `times` of all
-    /// steps of the run.
-    pub(super) fn add(&mut self, at_s: f64, times: StepTimes, steps: u32, load: &Load) {
-        let (Work { steps: before, raster, gaussians, moving }, count) =
-            (self.0.back().map(|last| last.work).unwrap_or_default(), f64::from(steps));
-        let work = Work {
-            steps: before + count,
-            raster: raster + count * load.raster(),
-            gaussians: gaussians + count * load.gaussians,
-            moving: moving + count * load.moving,
+    /// steps of the run. The first ones of a stage count only where there are no others.
+    pub(super) fn add(&mut self, at_s: f64, times: StepTimes, steps: u32, load: &Load, are_first: bool) {
+        let now = times.seconds_by_growth();
+        let Some((before_s, before)) = self.last.replace((at_s, now)) else { return };
+        let count = f64::from(steps);
+        let report = Report {
+            at_s,
+            seconds: at_s - before_s,
+            parts: std::array::from_fn(|part| now[part] - before[part]),
+            work: Work {
+                steps: count,
+                raster: count * load.raster(),
+                gaussians: count * load.gaussians,
+                moving: count * load.moving,
+            },
+            is_typical: !are_first || !self.reports.iter().any(|report| report.work.steps > 0.0),
         };
-        self.0.push_back(Report { at_s, times, work });
+        self.reports.push_back(report);
         let window_s = (RECENT * at_s).clamp(SHORTEST_S, LONGEST_S);
-        while self.0.len() > 2 && at_s - self.0[1].at_s >= window_s {
-            self.0.pop_front();
+        while self.reports.len() > 1 && at_s - self.reports[0].at_s >= window_s {
+            self.reports.pop_front();
         }
     }
 
     /// Steps per second between the last two reports.
     pub(super) fn rate(&self) -> f64 {
-        let mut last = self.0.iter().rev();
-        let (Some(last), Some(before)) = (last.next(), last.next()) else { return 0.0 };
-        (last.work.steps - before.work.steps) / (last.at_s - before.at_s).max(1e-9)
+        self.reports.back().map_or(0.0, |last| last.work.steps / last.seconds.max(1e-9))
     }
 
     /// The cost of a step; `None` before two reports.
     pub(super) fn cost(&self) -> Option<StepCost> {
-        let (first, last) = (self.0.front()?, self.0.back()?);
-        let work = Work {
-            steps: last.work.steps - first.work.steps,
-            raster: last.work.raster - first.work.raster,
-            gaussians: last.work.gaussians - first.work.gaussians,
-            moving: last.work.moving - first.work.moving,
-        };
-        let (now, then) = (last.times.seconds_by_growth(), first.times.seconds_by_growth());
-        let parts = std::array::from_fn(|part| now[part] - then[part]);
-        (work.steps > 0.0).then(|| StepCost::of(&work, last.at_s - first.at_s, parts))
+        let mut sums = Report::default();
+        // Long ago, others may have been typical.
+        let are_typical = self.reports.iter().any(|report| report.is_typical && report.work.steps > 0.0);
+        for report in self.reports.iter().filter(|report| report.is_typical || !are_typical) {
+            sums.seconds += report.seconds;
+            for (sum, part) in sums.parts.iter_mut().zip(report.parts) {
+                *sum += part;
+            }
+            sums.work.steps += report.work.steps;
+            sums.work.raster += report.work.raster;
+            sums.work.gaussians += report.work.gaussians;
+            sums.work.moving += report.work.moving;
+        }
+        (sums.work.steps > 0.0).then(|| StepCost::of(&sums.work, sums.seconds, sums.parts))
     }
 }
 
@@ -196,24 +212,29 @@ mod tests {
         let mut reports = Reports::default();
         let step = Load { pixels: 1.0, gaussians: 1e3, moving: 0.0 };
         let mut at_s = 0.0;
-        let mut run = |reports: &mut Reports, steps: u32, step_s: f64| {
+        let mut run = |reports: &mut Reports, steps: u32, step_s: f64, are_first: bool| {
             at_s += f64::from(steps) * step_s;
             let times = StepTimes { total: seconds(at_s), losses: seconds(at_s), ..StepTimes::default() };
-            reports.add(at_s, times, steps, &step);
+            reports.add(at_s, times, steps, &step, are_first);
         };
         assert_eq!(reports.cost(), None);
-        run(&mut reports, 0, 0.0);
+        run(&mut reports, 0, 0.0, false);
         for _ in 0..100 {
-            run(&mut reports, 10, 0.01);
+            run(&mut reports, 10, 0.01, false);
         }
         // A report with a second of other work.
-        run(&mut reports, 1, 1.0);
+        run(&mut reports, 1, 1.0, false);
         assert!((reports.rate() - 1.0).abs() < 1e-9);
         let cost = reports.cost().unwrap().step_s(&step);
         assert!((0.01..0.012).contains(&cost), "{cost}");
+        // A stage begins with steps that take memory.
+        run(&mut reports, 10, 0.5, true);
+        assert!((reports.rate() - 2.0).abs() < 1e-9);
+        let cost = reports.cost().unwrap().step_s(&step);
+        assert!((0.01..0.013).contains(&cost), "{cost}");
         // The machine becomes half as fast, for good.
         for _ in 0..400 {
-            run(&mut reports, 10, 0.02);
+            run(&mut reports, 10, 0.02, false);
         }
         let cost = reports.cost().unwrap().step_s(&step);
         assert!((cost - 0.02).abs() < 1e-9, "{cost}");

@@ -72,7 +72,8 @@ impl Trainer {
         };
         let stages = [Stage::Coarse, Stage::Fine, Stage::Instance];
         let at_s = stages.map(|stage| phases.spent(Phase::from(stage)).wall_s).iter().sum();
-        self.reports.add(at_s, *times, steps, &load);
+        let are_first = self.state.progress.iteration == steps;
+        self.reports.add(at_s, *times, steps, &load, are_first);
     }
 
     /// Gaussians that the deformation network moves.
@@ -244,8 +245,8 @@ mod tests {
         // Steps on half-size images take a second; parts are not timed.
         let (n, times) = (now, StepTimes::default());
         let step = |pixels: f64| Load { pixels, gaussians: n, moving: n };
-        trainer.reports.add(0.0, times, 0, &step(0.25));
-        trainer.reports.add(10.0, times, 10, &step(0.25));
+        trainer.reports.add(0.0, times, 0, &step(0.25), false);
+        trainer.reports.add(10.0, times, 10, &step(0.25), false);
         let cost = |pixels: f64| PIXEL_SHARE * raster_cost(4.0 * pixels, 1.0) + 1.0 - PIXEL_SHARE;
         let identity = STEPS_OF_IDENTITY_VIEW * trainer.identity_views(Stage::Fine) as f64;
         let expected = 40.0 + (40.0 + INSTANCE * identity) * cost(1.0) + 20.0 * cost(4.0);
@@ -254,8 +255,8 @@ mod tests {
         // Steps of the size that is worked on take two seconds.
         trainer.state.progress.iteration = 80;
         trainer.reports = Reports::default();
-        trainer.reports.add(0.0, times, 0, &step(1.0));
-        trainer.reports.add(20.0, times, 10, &step(1.0));
+        trainer.reports.add(0.0, times, 0, &step(1.0), false);
+        trainer.reports.add(20.0, times, 10, &step(1.0), false);
         let expected = 2.0 * (20.0 * cost(1.0) + INSTANCE * identity);
         let eta_s = trainer.eta_s(Stage::Fine);
         assert!((eta_s / expected - 1.0).abs() < 1e-6, "{eta_s} {expected}");
