@@ -118,7 +118,7 @@ pub struct StageShare {
 /// Work to come that is no step of a stage.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct OtherWork {
-    /// Views that identities will still be worked out from, each as often as that is done.
+    /// Views that identities will still be estimated from.
     pub identity_views: usize,
     /// True where objects are fitted behind the present stage.
     pub has_fits: bool,

@@ -55,7 +55,7 @@ impl Trainer {
         };
         let stages = [Stage::Coarse, Stage::Fine, Stage::Instance].into_iter().filter(|of| *of >= stage);
         let identity_s = STEPS_OF_IDENTITY_VIEW
-            * self.identity_views(stage) as f64
+            * self.identity_views(stage).iter().sum::<usize>() as f64
             * step_s(Stage::Instance, all(Stage::Instance));
         let fits_s = if stage == Stage::Coarse { self.fits_s() } else { 0.0 };
         stages.map(left_s).sum::<f64>() + identity_s + fits_s
@@ -248,7 +248,8 @@ mod tests {
         trainer.reports.add(0.0, times, 0, &step(0.25), false);
         trainer.reports.add(10.0, times, 10, &step(0.25), false);
         let cost = |pixels: f64| PIXEL_SHARE * raster_cost(4.0 * pixels, 1.0) + 1.0 - PIXEL_SHARE;
-        let identity = STEPS_OF_IDENTITY_VIEW * trainer.identity_views(Stage::Fine) as f64;
+        let identity =
+            STEPS_OF_IDENTITY_VIEW * trainer.identity_views(Stage::Fine).iter().sum::<usize>() as f64;
         let expected = 40.0 + (40.0 + INSTANCE * identity) * cost(1.0) + 20.0 * cost(4.0);
         let eta_s = trainer.eta_s(Stage::Fine);
         assert!((eta_s / expected - 1.0).abs() < 1e-6, "{eta_s} {expected}");

@@ -82,7 +82,7 @@ impl Trainer {
             .filter(|(other, steps, _)| *steps > 0 || *other == stage)
             .collect();
         let other = OtherWork {
-            identity_views: self.identity_views(stage),
+            identity_views: self.identity_views(stage)[0],
             has_fits: stage == Stage::Coarse && self.objects_to_fit() > 0,
         };
         let now = self.state.phases.now();
@@ -104,13 +104,13 @@ impl Trainer {
         }
     }
 
-    /// Views that identities will still be worked out from in a stage, or behind it.
-    pub(super) fn identity_views(&self, stage: Stage) -> usize {
+    /// Views that identities will still be worked out from in a stage, or behind it: before the instance stage, and behind.
+    pub(super) fn identity_views(&self, stage: Stage) -> [usize; 2] {
         if !self.stages.has_instances {
-            return 0;
+            return [0; 2];
         }
         let [before, behind] = identity_views(&self.state.config, self.state.frames.len());
-        behind + if stage < Stage::Identity { before } else { 0 }
+        [if stage < Stage::Identity { before } else { 0 }, behind]
     }
 
     /// Time by which fits have to be done that a budget can do without.

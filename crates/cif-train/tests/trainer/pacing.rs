@@ -177,7 +177,8 @@ fn steps_are_measured_and_settings_chosen() {
     assert_eq!((calibration.initial, calibration.most, calibration.gaussians), (450, 800, 800));
     // The clock is read around all steps, and after each from the third on.
     assert_eq!(calibration.steps, 7);
-    assert!((calibration.step_s - 0.6 / 7.0).abs() < 1e-9, "{calibration:?}");
+    // Trained Gaussians take longer than those that points are split into.
+    assert!((calibration.step_s - 1.3 * 0.6 / 7.0).abs() < 1e-9, "{calibration:?}");
     let work = Workload::of(&dataset, 0);
     assert_eq!((work.is_dynamic, work.has_instances, work.frames), (true, true, 12));
     let choice = choose(&base, &calibration, work, 20.0);
