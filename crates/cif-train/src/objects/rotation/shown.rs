@@ -14,7 +14,8 @@ const PIXELS: usize = 400;
 
 /// Turns of paint, of the angle by which a camera goes around, that a surface at rest seems to have where it is modelled at
 /// another depth than its own: `1 - r / R` of paint at a radius `r` where `R` is modelled, from a model of half the size (-10
-/// tenths) to the far wall that an opening shows (20). A tenth of the way of a camera is about the width of a cell of paint.
+/// tenths) to the far wall that an opening shows (20). The paint of a vase at rest slides by -0.2: turns beat that by 0.6
+/// standard errors, slides of 0.1 less or more by up to 2.1, and what steps of a half try by 4.5.
 const SLIDES: std::ops::RangeInclusive<i32> = -10..=20;
 
 /// Places of a surface that pixels show, and how well they are explained where nothing turns.
