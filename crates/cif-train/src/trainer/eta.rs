@@ -78,16 +78,15 @@ impl Trainer {
 
     /// Gaussians that the deformation network moves.
     fn moving(&self) -> f64 {
+        let Some(deformation) = &self.state.field.deformation else { return 0.0 };
+        self.without_pose().filter(|row| !deformation.is_still(*row)).count() as f64
+    }
+
+    /// Gaussians that have no poses.
+    fn without_pose(&self) -> impl Iterator<Item = usize> + '_ {
         let field = &self.state.field;
-        let Some(deformation) = &field.deformation else { return 0.0 };
-        let has_pose = |row: &usize| {
-            field
-                .tracks
-                .as_ref()
-                .is_some_and(|tracks| tracks.group_of.get(*row).is_some_and(|of| *of != NO_GROUP))
-        };
-        let is_still = |row: &usize| deformation.still.get(*row).copied().unwrap_or_default();
-        (0..field.gaussians.len()).filter(|row| !is_still(row) && !has_pose(row)).count() as f64
+        let group_of = |row: usize| field.tracks.as_ref()?.group_of.get(row).filter(|of| **of != NO_GROUP);
+        (0..field.gaussians.len()).filter(move |row| group_of(*row).is_none())
     }
 
     /// Share of the Gaussians that the deformation network moves, or will once there is one.
@@ -109,7 +108,8 @@ impl Trainer {
     /// The step of the fine stage that looks for Gaussians that stand still before any does; `None` where this step does not
     /// come.
     fn first_test(&self, stage: Stage) -> Option<u32> {
-        let still = |deformation: &Deformation| deformation.still.contains(&true);
+        // What has poses never goes through the network.
+        let still = |deformation: &Deformation| self.without_pose().any(|row| deformation.is_still(row));
         if stage != Stage::Fine || self.state.field.deformation.as_ref().is_none_or(still) {
             return None;
         }
@@ -175,6 +175,7 @@ mod tests {
     use std::time::Duration;
 
     use cif_field::Gaussians;
+    use cif_field::tracks::Tracks;
 
     use super::super::cost::Reports;
     use super::super::guard_tests::support::{Scene, capture, small_config};
@@ -278,6 +279,12 @@ mod tests {
         assert_eq!(trainer.first_test(Stage::Fine), Some(30));
         assert_eq!(trainer.first_test(Stage::Coarse), None);
         let count = trainer.field().gaussians.len();
+        // What has poses stands still from the start.
+        let field = &mut trainer.state.field;
+        let group_of = (0..count).map(|row| if row < 5 { 0 } else { NO_GROUP }).collect();
+        field.tracks = Some(Tracks { group_of, ..Tracks::default() });
+        field.deformation.as_mut().unwrap().still = (0..count).map(|row| row < 5).collect();
+        assert_eq!(trainer.first_test(Stage::Fine), Some(30));
         trainer.state.field.deformation.as_mut().unwrap().still = vec![true; count];
         assert_eq!(trainer.first_test(Stage::Fine), None, "it is known");
     }
