@@ -205,7 +205,7 @@ pub struct MotionConfig {
     pub guidance: f32,
     /// Share of `guidance` that is left at the end of the fine stage, default 0.1.
     pub guidance_end: f32,
-    /// Weight of the displacement of everything that does not travel, relative to the extent; default 1.
+    /// Weight of the displacement of what neither travels nor deforms, relative to the extent; default 1.
     pub stillness: f32,
     /// Steps that teach the deformation the paths, and how objects deform, before the fine stage, default 300.
     pub rehearsal: u32,
