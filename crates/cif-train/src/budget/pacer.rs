@@ -101,7 +101,7 @@ pub(crate) const TRIALS: [f64; 2] = [0.05, 0.05];
 pub(crate) const REHEARSAL: f64 = 0.1;
 
 /// Time of one view of those that identities are worked out from, before and behind the instance stage, in steps of the fine
-/// stage: 0.28 to 0.51 on five captures.
+/// stage: 0.28 to 0.51 in five runs on four captures.
 pub(crate) const STEPS_OF_IDENTITY_VIEW: f64 = 0.4;
 
 /// A stage to come with its weight: expected time relative to the others.

@@ -13,7 +13,8 @@ const SHORTEST_S: f64 = 10.0;
 const LONGEST_S: f64 = 60.0;
 
 /// Time of a fine step for each of its Gaussians, for each that moves, and whatever it works on, in that which a coarse step
-/// takes for each of its Gaussians, apart from rasterising: 1.3 to 2.1, 4.8 to 9.2 and 4 100 to 7 000 on four captures of two sizes.
+/// takes for each of its Gaussians, apart from rasterising: 1.3 to 2.1, 4.8 to 9.2 and 4 100 to 7 000 on four captures of two
+/// sizes.
 const ROWS: f64 = 1.5;
 const MOVING_ROWS: f64 = 6.0;
 const FIXED_ROWS: f64 = 5_000.0;
@@ -100,7 +101,7 @@ impl Reports {
     /// The cost of a step; `None` before two reports.
     pub(super) fn cost(&self) -> Option<StepCost> {
         let mut sums = Report::default();
-        // Long ago, others may have been typical.
+        // Where no others are recent enough, the first ones of a stage have to do.
         let are_typical = self.reports.iter().any(|report| report.is_typical && report.work.steps > 0.0);
         for report in self.reports.iter().filter(|report| report.is_typical || !are_typical) {
             sums.seconds += report.seconds;
