@@ -80,6 +80,8 @@ impl Shifts {
 struct Bend {
     shifts: Shifts,
     moments: Vec<Adam>,
+    /// By knot, true where some view showed it.
+    is_seen: Vec<bool>,
     /// First rate of the coefficients, metres.
     rate: f64,
 }
@@ -92,7 +94,12 @@ impl Bend {
         let (knot, size) = (effort.knot, fit.size());
         let count = (last - first) / knot + 2;
         let shifts = Shifts { first, knot, size, knots: vec![[DVec3::ZERO; TERMS]; count] };
-        Self { shifts, moments: vec![Adam::new(3 * TERMS); count], rate: effort.rate * size }
+        Self {
+            shifts,
+            moments: vec![Adam::new(3 * TERMS); count],
+            is_seen: vec![false; count],
+            rate: effort.rate * size,
+        }
     }
 
     /// A step against the gradients by the shifted places of a time, at a share of the first rate.
@@ -105,10 +112,25 @@ impl Bend {
             }
         }
         for (knot, weight) in self.shifts.knots_around(time) {
+            self.is_seen[knot] |= weight > 0.0;
             let values = sums.iter().flat_map(|sum| (weight * *sum).to_array());
             let coefficients = &mut self.shifts.knots[knot];
             self.moments[knot].step(values, rate, |k, step| coefficients[k / 3][k % 3] -= step);
         }
+    }
+
+    /// The shifts, those of knots that no view showed between those of the nearest ones that some did.
+    fn filled(self) -> Shifts {
+        let Self { mut shifts, is_seen, .. } = self;
+        let seen = |knots: std::ops::Range<usize>| knots.filter(|knot| is_seen[*knot]);
+        for knot in (0..is_seen.len()).filter(|knot| !is_seen[*knot]) {
+            let (before, after) = (seen(0..knot).next_back(), seen(knot..is_seen.len()).next());
+            let Some((before, after)) = before.or(after).zip(after.or(before)) else { continue };
+            let share = (knot - before.min(knot)) as f64 / after.abs_diff(before).max(1) as f64;
+            let [a, b] = [before, after].map(|knot| shifts.knots[knot]);
+            shifts.knots[knot] = std::array::from_fn(|k| a[k].lerp(b[k], share));
+        }
+        shifts
     }
 }
 
@@ -116,7 +138,7 @@ impl Bend {
 fn loss(
     fit: &Fit<'_>,
     shape: &mut Shape,
-    bend: Option<&Bend>,
+    shifts: Option<&Shifts>,
     view: usize,
     level: usize,
     differentiates: bool,
@@ -124,8 +146,8 @@ fn loss(
     let view = &fit.views[view];
     let Some(pose) = fit.poses.get(&view.time_index) else { return 0.0 };
     let places = shape.centres();
-    if let Some(bend) = bend {
-        shape.set_centres(&bend.shifts.shifted(view.time_index, &places));
+    if let Some(shifts) = shifts {
+        shape.set_centres(&shifts.shifted(view.time_index, &places));
     }
     let value = shape.loss(&view.crops[level], pose, GREY, 1.0, differentiates).value;
     shape.set_centres(&places);
@@ -139,7 +161,7 @@ fn refitted(
     steps: usize,
     views: &SplitViews,
     level: usize,
-) -> (Shape, Option<Bend>, f64) {
+) -> (Shape, Option<Shifts>, f64) {
     let (mut shape, mut rng, mut order) = (fit.shape.copied(), fit.rng.clone(), views.train.clone());
     for step in 0..if order.is_empty() { 0 } else { steps } {
         let place = step % order.len();
@@ -148,18 +170,19 @@ fn refitted(
         }
         let (view, rate) = (order[place], LAST.powf(step as f64 / steps as f64));
         let places = shape.centres();
-        loss(fit, &mut shape, bend.as_ref(), view, level, true);
+        loss(fit, &mut shape, bend.as_ref().map(|bend| &bend.shifts), view, level, true);
         if let Some(bend) = &mut bend {
             bend.step(fit.views[view].time_index, &places, &shape.centre_gradients(), rate);
         }
         shape.step(SHAPE_RATE * rate);
     }
+    let shifts = bend.map(Bend::filled);
     let weight = |view: &usize| fit.views[*view].visible;
-    let mut judge = |view: &usize| weight(view) * loss(fit, &mut shape, bend.as_ref(), *view, level, false);
+    let mut judge = |view: &usize| weight(view) * loss(fit, &mut shape, shifts.as_ref(), *view, level, false);
     let judged = views.judged();
     let sum: f64 = judged.iter().map(&mut judge).sum();
     let error = sum / judged.iter().map(weight).sum::<f64>().max(1e-12);
-    (shape, bend, error)
+    (shape, shifts, error)
 }
 
 /// Error of an object that may bend, on views that were left out.
@@ -177,6 +200,34 @@ pub(super) fn gain(fit: &Fit<'_>, views: &SplitViews, level: usize) -> f64 {
 /// An object that bends in one place, explained as well as it can be: its Gaussians and shifts, in its frame, with the
 /// error on views that were left out.
 pub(super) fn bending(fit: &Fit<'_>, views: &SplitViews) -> Option<(Gaussians, Shifts, f64)> {
-    let (shape, bend, error) = refitted(fit, Some(Bend::none(fit, WELL)), WELL.steps, views, 0);
-    Some((shape.gaussians().clone(), bend?.shifts, error))
+    let (shape, shifts, error) = refitted(fit, Some(Bend::none(fit, WELL)), WELL.steps, views, 0);
+    Some((shape.gaussians().clone(), shifts?, error))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shifts_at_times_that_nothing_shows_lie_between_those_around_them() {
+        let at = |x: f64| [DVec3::X * x; TERMS];
+        let bend = |is_seen: &[bool]| Bend {
+            shifts: Shifts {
+                first: 0,
+                knot: 2,
+                size: 1.0,
+                knots: vec![at(1.0), at(0.0), at(0.0), at(4.0), at(0.0)],
+            },
+            moments: Vec::new(),
+            is_seen: is_seen.to_vec(),
+            rate: 0.0,
+        };
+        let filled = |is_seen: &[bool]| -> Vec<f64> {
+            bend(is_seen).filled().knots.iter().map(|terms| terms[3].x).collect()
+        };
+        assert_eq!(filled(&[true, false, false, true, false]), [1.0, 2.0, 3.0, 4.0, 4.0]);
+        assert_eq!(filled(&[true; 5]), [1.0, 0.0, 0.0, 4.0, 0.0], "what was seen stays");
+        assert_eq!(filled(&[false, true, false, false, false]), [0.0; 5]);
+        assert_eq!(filled(&[false; 5]), [1.0, 0.0, 0.0, 4.0, 0.0], "nothing to lie between");
+    }
 }

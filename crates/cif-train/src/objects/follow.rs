@@ -63,8 +63,7 @@ pub(super) fn follow(
     let mut order: Vec<usize> =
         at.keys().copied().filter(|t| !fit.poses.contains_key(t) && path.contains_key(t)).collect();
     let starts: Vec<usize> = fit.poses.keys().copied().collect();
-    let start =
-        |time: usize| starts.iter().copied().min_by_key(|start| start.abs_diff(time)).unwrap_or(reference);
+    let start = |time: usize| nearest(starts.iter().copied(), time).unwrap_or(reference);
     order.sort_by_key(|time| time.abs_diff(start(*time)));
     if fit.poses.len() > 1 {
         let known: Vec<usize> = fit.poses.keys().flat_map(|time| at[time].iter().copied()).collect();
@@ -98,6 +97,11 @@ pub(super) fn follow(
         }
     }
     Ok(())
+}
+
+/// The one of some times, in their order, that is nearest to another.
+pub(super) fn nearest(times: impl Iterator<Item = usize>, to: usize) -> Option<usize> {
+    times.min_by_key(|time| time.abs_diff(to))
 }
 
 /// Makes the shape anew from all times that are known, and fits it in so many steps, poses at a rate: what few views

@@ -28,6 +28,9 @@ pub(crate) struct KnownObjects {
     pub(crate) is_searched: bool,
 }
 
+/// Error of what stays in place, of that of a motion as a whole, up to which it explains as much, with less freedom.
+const AS_MUCH: f64 = 1.02;
+
 /// Start of the names of tensors.
 const TENSORS: &str = "objects.";
 
@@ -67,10 +70,10 @@ impl KnownObjects {
 
     /// Keeps what was looked for of an object that stays in place, instead of a motion as a whole that explains no more.
     pub(crate) fn insert_in_place(&mut self, label: u16, found: Option<InPlace>) {
-        let whole = self.moving(label).map_or(f64::INFINITY, |whole| whole.error);
+        let most = self.moving(label).map_or(f64::INFINITY, |whole| AS_MUCH * whole.error);
         match found {
-            Some(InPlace::Jointed(part)) if part.errors[0] <= whole => self.insert_turning(label, part),
-            Some(InPlace::Bends(bending)) if bending.error <= whole => {
+            Some(InPlace::Jointed(part)) if part.errors[0] <= most => self.insert_turning(label, part),
+            Some(InPlace::Bends(bending)) if bending.error <= most => {
                 self.rigid.insert(label, Found::Nothing);
                 self.parts.insert(label, None);
                 self.bending.insert(label, bending);
@@ -185,14 +188,14 @@ mod tests {
             unturned: None,
             bent: None,
             is_ball: false,
-            is_settled: false,
+            is_surrounded: false,
             way: "slides".into(),
         }))
     }
 
     #[test]
     fn a_part_is_kept_instead_of_a_motion_as_a_whole_that_explains_no_more() {
-        for (of_part, of_whole, is_kept) in [(0.10, 0.11, true), (0.11, 0.11, true), (0.12, 0.11, false)] {
+        for (of_part, of_whole, is_kept) in [(0.10, 0.11, true), (0.112, 0.11, true), (0.114, 0.11, false)] {
             let mut known = KnownObjects::default();
             known.rigid.insert(1, whole(of_whole));
             known.insert_in_place(1, Some(InPlace::Jointed(part(of_part))));

@@ -13,6 +13,7 @@ use super::hull::hull;
 use super::order::Order;
 use super::outline::Outline;
 use super::plane::Plane;
+use super::rests::{Explained, jump, likeliest};
 use super::shape::{Pose, Shape};
 use super::view::{ObjectView, is_one_camera, meeting_point};
 use super::ways::Way;
@@ -30,9 +31,8 @@ pub(super) const STANDS: f64 = 0.03;
 /// Steps of Gaussians that are made anew from where an object was followed to, and rate of poses meanwhile.
 const CARVED: (usize, f64) = (600, 0.3);
 
-/// Loss of what was followed from another start, of the best, up to which it explains as much, and the turn from which it is
-/// another motion, degrees.
-const RIVAL: (f64, f64) = (1.02, 30.0);
+/// Turn from which what was followed from another start is another motion, degrees.
+const APART: f64 = 30.0;
 
 /// Gaussians of an object that is followed.
 pub(super) const FOLLOWED: usize = 300;
@@ -93,6 +93,12 @@ pub(super) struct Followed<'a> {
     pub(super) fit: Fit<'a>,
     /// True where no other start leads to other turns that explain as much.
     pub(super) is_decided: bool,
+}
+
+/// An object followed from one of its starts.
+struct Path<'a> {
+    fit: Fit<'a>,
+    explained: Explained,
 }
 
 /// Where an object is followed from.
@@ -196,29 +202,30 @@ impl<'a> Object<'a> {
         views: &[usize],
         off: Option<&[usize]>,
     ) -> Result<Option<Followed<'a>>, TrainError> {
-        let followed = |poses: &BTreeMap<usize, Pose>| -> Result<Option<(f64, Fit<'a>)>, TrainError> {
+        let followed = |poses: &BTreeMap<usize, Pose>| -> Result<Option<Path<'a>>, TrainError> {
             let Some(mut fit) = self.started(poses, path) else { return Ok(None) };
             if let Some(off) = off {
                 fit.air = off.to_vec();
             }
             follow(&mut fit, starts.reference, path, views, self.surroundings.phases)?;
             let loss = if starts.poses.len() > 1 { self.carved_loss(&fit, views)? } else { 0.0 };
-            Ok(Some((loss, fit)))
+            let explained = Explained { loss, jump: jump(&fit.poses, poses) };
+            Ok(Some(Path { fit, explained }))
         };
         let followed = starts.poses.par_iter().map(followed).collect::<Result<Vec<_>, TrainError>>()?;
-        let mut followed: Vec<(f64, Fit<'a>)> = followed.into_iter().flatten().collect();
-        followed.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let Some((best, others)) = followed.split_first() else { return Ok(None) };
-        let is_rival = |(loss, fit): &(f64, Fit<'a>)| {
-            let turned = |(time, pose): (&usize, &Pose)| {
-                let other = fit.poses.get(time)?.rotation;
-                Some(pose.rotation.angle_between(other).to_degrees())
+        let mut followed: Vec<Path<'a>> = followed.into_iter().flatten().collect();
+        let explained: Vec<Explained> = followed.iter().map(|path| path.explained).collect();
+        let Some(likeliest) = likeliest(&explained) else { return Ok(None) };
+        let Path { fit, explained } = followed.swap_remove(likeliest);
+        let turned = |other: &Fit<'_>| {
+            let angle = |(time, pose): (&usize, &Pose)| {
+                Some(pose.rotation.angle_between(other.poses.get(time)?.rotation).to_degrees())
             };
-            let apart = best.1.poses.iter().filter_map(turned).fold(0.0, f64::max);
-            *loss <= RIVAL.0 * best.0 && apart > RIVAL.1
+            fit.poses.iter().filter_map(angle).fold(0.0, f64::max)
         };
-        let is_decided = !others.iter().any(is_rival);
-        Ok(followed.into_iter().next().map(|(_, fit)| Followed { fit, is_decided }))
+        let rivals = |path: &Path<'a>| path.explained.rivals(&explained) && turned(&path.fit) > APART;
+        let is_decided = !followed.iter().any(rivals);
+        Ok(Some(Followed { fit, is_decided }))
     }
 
     /// Loss of Gaussians that are made anew from all poses of a fit: where it was followed wrongly, poses that each explain

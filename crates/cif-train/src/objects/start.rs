@@ -69,8 +69,10 @@ pub(crate) struct Fitted {
     pub(crate) bent: Option<f64>,
     /// True of a ball.
     pub(crate) is_ball: bool,
-    /// True where the poses of what was left out were moved onto it before, so that errors are smaller.
-    pub(crate) is_settled: bool,
+    /// True of what one camera sees from other sides all the time: a pose of its own explains each, so that errors are
+    /// smaller.
+    #[serde(alias = "is_settled")]
+    pub(crate) is_surrounded: bool,
     /// Way of moving that was kept, in words.
     pub(crate) way: String,
 }
@@ -145,7 +147,7 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
         unturned,
         bent,
         is_ball: outline.roundness >= 1.0,
-        is_settled: outline.is_surrounded && fit.one_camera,
+        is_surrounded: outline.is_surrounded && fit.one_camera,
         way: way.in_words(),
     }))
 }

@@ -88,6 +88,22 @@ fn a_textured_box_that_slides_and_turns_is_found() {
     assert!(fitted.error < 0.1, "{}", fitted.error);
 }
 
+#[test]
+fn what_slides_unevenly_is_judged_by_its_looks_and_not_by_where_it_is_between() {
+    let pose = |k: usize| {
+        // At times that are left out it is ahead of the middle of their neighbours by more than half a step.
+        let ahead = if k % 4 == 2 { 0.6 } else { 0.0 };
+        let share = (k as f64 + ahead) / (TIMES - 1) as f64;
+        (DQuat::from_rotation_z(1.4 * share), DVec3::new(-0.2 + 0.4 * share, 0.1 * share, 0.05))
+    };
+    let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(pose).collect();
+    let fitted = fit(&views(solid(&box_places(), patches, 0.006), &truth, moving));
+    let (turn, shift) = errors(&fitted.poses, &truth);
+    assert!(turn < 4.0 && shift < 0.008, "{turn} deg, {shift} m, {}", fitted.way);
+    assert_eq!(fitted.rotation, RotationEvidence::Observed);
+    assert!(fitted.error < 0.05, "{}", fitted.error);
+}
+
 /// Rolls without slip, with a radius up to the middle of its outermost Gaussians and their thickness.
 fn rolling(radius: f64) -> Vec<(DQuat, DVec3)> {
     (0..TIMES)

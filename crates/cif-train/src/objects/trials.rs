@@ -133,8 +133,6 @@ struct Contest<'a> {
 struct Simple {
     /// Error of resting, on the views that were left out.
     at_rest: Option<f64>,
-    /// Error of sliding without a turn, on the same views.
-    slides: Option<f64>,
     /// True where resting explains about as much as sliding.
     stays: bool,
     /// True where neither explains what is seen.
@@ -160,8 +158,12 @@ pub(super) fn best_way<'a>(
     reliable: &[usize],
 ) -> Result<Option<Started<'a>>, TrainError> {
     let mut contest = Contest::new(object, reliable);
-    let trials = contest.simple()?;
+    let mut trials = contest.simple()?;
     let simple = contest.judged_simple(&trials);
+    if !contest.may_be_followed() {
+        contest.judge(&mut trials, false);
+    }
+    let unturned = error_of(&trials, Way::Slide(0));
     let resting = contest.bendable(&trials, &simple);
     let Some(trials) = contest.worthwhile(trials, &simple)? else { return Ok(None) };
     let Some(chosen) = contest.chosen(&trials) else { return Ok(None) };
@@ -183,7 +185,6 @@ pub(super) fn best_way<'a>(
     }
     contest.hold(&mut fit, &chosen);
     let Chosen { way, rotation, .. } = chosen;
-    let unturned = simple.slides;
     let is_turned = rotation == RotationEvidence::Observed;
     let is_shown = match chosen.is_shown {
         Some(is_shown) if way == Way::Followed => is_shown,
@@ -235,7 +236,6 @@ impl<'a> Contest<'a> {
     fn judged_simple(&self, trials: &[Trial<'_>]) -> Simple {
         Simple {
             at_rest: error_of(trials, Way::Rest),
-            slides: error_of(trials, Way::Slide(0)),
             stays: is_at_rest(trials, Way::Slide(0), REST_GAIN[0]),
             is_unexplained: self.is_unexplained(trials),
         }
@@ -342,11 +342,12 @@ impl<'a> Contest<'a> {
         shown(self.object.views, self.object.outline.size(), poses, rivals)
     }
 
-    /// Trials of resting, and of moving along the path without a turn: most objects that do not travel rest.
+    /// Trials of resting, and of moving along the path without a turn: most objects that do not travel rest, and poses that
+    /// are moved onto rough masks explain more than rest does. What may be followed is judged as it will be.
     fn simple(&self) -> Result<Vec<Trial<'a>>, TrainError> {
         let mut trials = self.begin(&[Way::Rest, Way::Slide(0)], GAUSSIANS);
         self.advance(&mut trials, 0..STEPS[1], false)?;
-        self.judge(&mut trials, false);
+        self.judge_as(&mut trials, false, self.may_be_followed());
         Ok(trials)
     }
 
@@ -533,8 +534,8 @@ impl<'a> Contest<'a> {
         self.object.surroundings.phases.check()
     }
 
-    /// Moves the poses of times that were left out onto their views, the shape as it is: from one side to the next an
-    /// object turns more than its neighbours imply, and how it looks from there is what is judged.
+    /// Moves the poses of times that were left out onto their views, the shape as it is: an object moves otherwise than its
+    /// neighbours in time imply, and how it looks from there is what is judged, not where it is.
     fn settle(&self, fit: &mut Fit<'_>, level: usize) {
         let mut shape = fit.shape.copied();
         let is_between = |view: &&usize| self.between.contains(&self.object.views[**view].time_index);
@@ -546,8 +547,13 @@ impl<'a> Contest<'a> {
         }
     }
 
-    /// Losses on the views that were left out.
+    /// Losses on the views that were left out, with poses of times between that are moved onto these.
     fn judge(&self, trials: &mut [Trial<'a>], finely: bool) {
+        self.judge_as(trials, finely, true);
+    }
+
+    /// The same, or with poses of times between that lie between those of their neighbours.
+    fn judge_as(&self, trials: &mut [Trial<'a>], finely: bool, settles: bool) {
         trials.par_iter_mut().for_each(|trial| {
             for time in &self.between {
                 if let Some(pose) = trial.fit.pose_at(*time) {
@@ -555,7 +561,8 @@ impl<'a> Contest<'a> {
                 }
             }
             let level = if finely { 0 } else { trial.fit.trial_level() };
-            if self.may_be_followed() && trial.way != Way::Rest {
+            // A turn in place is judged by how far it is between.
+            if settles && !trial.fit.stays {
                 self.settle(&mut trial.fit, level);
             }
             trial.losses[1] = trial.fit.mean_loss(self.views.judged(), level);

@@ -29,7 +29,7 @@ pub(super) fn explained(gaussians: Gaussians) -> Fitted {
         unturned: None,
         bent: None,
         is_ball: false,
-        is_settled: false,
+        is_surrounded: false,
         way: "explained".to_owned(),
     }
 }
@@ -42,7 +42,7 @@ fn poses_are_kept_of_balls_with_rough_masks_and_of_what_turns() {
         error,
         unturned: Some(unturned),
         is_ball,
-        is_settled: true,
+        is_surrounded: true,
         ..explained(Gaussians::from_points(&[[0.0; 3]], &[[0.5; 3]]).unwrap())
     };
     let (observed, assumed) = (RotationEvidence::Observed, RotationEvidence::Assumed);
@@ -54,9 +54,9 @@ fn poses_are_kept_of_balls_with_rough_masks_and_of_what_turns() {
     assert!(!kept((0.12, 0.3), assumed, false));
     assert!(kept((0.2, 0.2), assumed, true));
     assert!(!kept((0.3, 0.5), observed, true));
-    let bends = |error: f64, bent: f64, is_settled: bool| {
+    let bends = |error: f64, bent: f64, is_surrounded: bool| {
         let fitted = fitted((error, error), observed, false);
-        is_rigid(&Fitted { bent: Some(bent), is_settled, ..fitted }, 0.22)
+        is_rigid(&Fitted { bent: Some(bent), is_surrounded, ..fitted }, 0.22)
     };
     assert!(bends(0.3, 1.0, false) && !bends(0.3, 0.95, false) && !bends(0.45, 1.0, false));
     assert!(bends(0.15, 0.9, false) && !bends(0.15, 0.7, false));

@@ -24,9 +24,9 @@ use crate::schedule::log_linear;
 use crate::stage::Stage;
 
 /// Error on pixels that were left out beyond which an object is not taken to be rigid: where the capture has points,
-/// where what it stands on is itself reconstructed, and where poses were moved onto these pixels.
+/// where what it stands on is itself reconstructed, and where one camera sees it from other sides all the time.
 const MOST_ERROR: [f64; 2] = [0.22, 0.15];
-const MOST_SETTLED: f64 = 0.095;
+const MOST_SURROUNDED: f64 = 0.095;
 
 /// The same of balls, which do not deform.
 const MOST_OF_BALL: f64 = 0.24;
@@ -59,11 +59,11 @@ const LAST: f32 = 0.05;
 /// Steps of the fine stage in which poses stay, while everything settles around them.
 const FROZEN: u32 = 300;
 
-/// True where poses explain an object, given the largest error of those that were not moved onto what was left out.
+/// True where poses explain an object, given the largest error of those that are not surrounded.
 pub(super) fn is_rigid(fitted: &Fitted, most: f64) -> bool {
-    let most = match (fitted.is_ball, fitted.is_settled) {
+    let most = match (fitted.is_ball, fitted.is_surrounded) {
         (true, _) => MOST_OF_BALL,
-        (false, true) => MOST_SETTLED,
+        (false, true) => MOST_SURROUNDED,
         (false, false) => most,
     };
     let explains = |unturned: f64| fitted.is_turned && fitted.error <= TURN_EXPLAINS * unturned;
@@ -71,7 +71,7 @@ pub(super) fn is_rigid(fitted: &Fitted, most: f64) -> bool {
     let deforms = !fitted.is_ball && fitted.bent.is_some_and(|bent| bent <= DEFORMS);
     let is_explained = fitted.error <= most
         || fitted.unturned.is_some_and(explains)
-        || (!fitted.is_settled && fitted.bent.is_some_and(bends_no_better));
+        || (!fitted.is_surrounded && fitted.bent.is_some_and(bends_no_better));
     is_explained && !deforms
 }
 

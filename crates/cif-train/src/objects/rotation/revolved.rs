@@ -89,7 +89,9 @@ impl<'a> Revolving<'a> {
         let shown = solid.shown(None)?;
         let found = shown.few.turned_about(axis);
         shown.errors(&self.evidence, &found)?;
-        shown.turns(&self.evidence, &found).then(|| shown.turning(&found).about(self.course, solid.middle))
+        shown
+            .turns_in_halves(&self.evidence, &found)
+            .then(|| shown.turning(&found).about(self.course, solid.middle))
     }
 
     /// The largest solid of revolution about an axis of this direction, on a support.

@@ -66,19 +66,28 @@ impl Shown {
         if is_shown { Some([mean(&residuals)?, self.few.error]) } else { None }
     }
 
-    /// True where a surface that is not known exactly has the turns that were found, and neither does paint slide over it
-    /// instead as the camera travels, nor all of it look another way from some time on: turns that each half of the surface
-    /// shows explain the other half better than any of this does.
+    /// True where neither paint that slides over the surface instead as the camera travels, nor another look of all of it from
+    /// some time on explains as much as turns that were found.
     pub(super) fn turns(&self, evidence: &Evidence<'_>, found: &Turned) -> bool {
+        self.beat_slides(evidence, found, &self.all.residuals(evidence, found, true))
+    }
+
+    /// The same of a surface that is not known exactly: turns that each half of it shows explain the other half better than
+    /// no turn and any of this do.
+    pub(super) fn turns_in_halves(&self, evidence: &Evidence<'_>, found: &Turned) -> bool {
         let crossed = self.crossed(evidence, found.axis);
+        beats(evidence, &crossed, &self.still) && self.beat_slides(evidence, found, &crossed)
+    }
+
+    /// True where residuals with turns are less than those with a look that changes, or with paint that slides.
+    fn beat_slides(&self, evidence: &Evidence<'_>, found: &Turned, residuals: &[f32]) -> bool {
         let sides = self.all.sides(found.axis);
         let slid = |tenths: i32| {
             let angles = sides.iter().map(|side| 0.1 * f64::from(tenths) * side).collect();
             self.all.residuals(evidence, &Turned { axis: found.axis, angles, cost: 0.0 }, true)
         };
-        beats(evidence, &crossed, &self.still)
-            && beats(evidence, &crossed, &self.all.changed(evidence, found))
-            && SLIDES.into_par_iter().all(|tenths| beats(evidence, &crossed, &slid(tenths)))
+        beats(evidence, residuals, &self.all.changed(evidence, found))
+            && SLIDES.into_par_iter().all(|tenths| beats(evidence, residuals, &slid(tenths)))
     }
 
     /// Residuals of the pixels of each half of the surface, above and below the middle of the axis, with the turns that the

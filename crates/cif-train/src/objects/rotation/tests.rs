@@ -78,8 +78,9 @@ fn what_stays_is_not_seen_to_turn() {
     }
 }
 
-/// Turns about the upright axis of a ball that is modelled with some radius: are they shown, and are they its own.
-fn shown_turns(turns: Course, radius: f64, cameras: Cameras) -> [bool; 2] {
+/// Turns about the upright axis of a ball that is modelled with some radius: are they shown, and are they its own, by all of
+/// it and by each half.
+fn shown_turns(turns: Course, radius: f64, cameras: Cameras) -> [bool; 3] {
     let ball = solid(&sphere_places(RADIUS), patches, 0.007);
     let seen = views(ball, &poses(&turns), cameras);
     let evidence = Evidence::of(seen.iter()).unwrap();
@@ -88,7 +89,8 @@ fn shown_turns(turns: Course, radius: f64, cameras: Cameras) -> [bool; 2] {
         |look: &Look<'_>, pixel: &Pixel| ball.outward(look.view.camera.centre(), pixel.ray.normalize());
     let shown = Shown::of(&evidence, Cells::OfBall(24.0), place).unwrap();
     let found = shown.few.turned_about(DVec3::Z);
-    [shown.errors(&evidence, &found).is_some(), shown.turns(&evidence, &found)]
+    let is_shown = shown.errors(&evidence, &found).is_some();
+    [is_shown, shown.turns(&evidence, &found), shown.turns_in_halves(&evidence, &found)]
 }
 
 #[test]
@@ -96,9 +98,9 @@ fn paint_that_slides_over_a_surface_at_another_depth_is_no_turn() {
     let around = |time: usize| vec![camera(3.0 * share(time))];
     let turning = |degrees: f64| course(degrees, DVec3::Z, stays);
     for larger in [1.35, 1.5, 1.8] {
-        assert_eq!(shown_turns(turning(0.0), larger * RADIUS, around), [true, false], "{larger}");
+        assert_eq!(shown_turns(turning(0.0), larger * RADIUS, around), [true, false, false], "{larger}");
     }
-    assert_eq!(shown_turns(turning(-200.0), RADIUS, moving), [true, true]);
+    assert_eq!(shown_turns(turning(-200.0), RADIUS, moving), [true, true, true]);
 }
 
 #[test]
@@ -107,7 +109,7 @@ fn what_looks_another_way_from_some_time_on_may_not_have_turned() {
     for pose in turns.values_mut().skip(TIMES / 2) {
         pose.rotation = DQuat::from_rotation_z(PI / 2.0);
     }
-    assert_eq!(shown_turns(turns, RADIUS, moving), [true, false]);
+    assert_eq!(shown_turns(turns, RADIUS, moving), [true, false, false]);
 }
 
 #[test]
