@@ -17,6 +17,7 @@
 //! | `ways` | which ways of moving are tried |
 //! | `sequence` | which values over time cost least |
 //! | `rests` | how it is turned between places at which it rests |
+//! | `likeliest` | which of the motions that several starts lead to is kept |
 //! | `follow` | how it moves from time to time |
 //! | `grow` | where it is when little of it is seen |
 //! | `mend` | which of its poses jump, and where they belong |
@@ -37,6 +38,7 @@ mod follow;
 mod grow;
 mod hull;
 mod known;
+mod likeliest;
 mod mend;
 mod object;
 mod order;
