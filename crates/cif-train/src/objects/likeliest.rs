@@ -12,7 +12,7 @@ const AS_LIKELY: f64 = 1.02;
 /// mirrored and backwards, are turned rightly with 0.18 to 0.56.
 const JUMPS: f64 = 0.3;
 
-/// How well an object that was followed from a start is explained.
+/// Evidence for the motion of an object that was followed from a start.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Explained {
     /// Loss of Gaussians that are made anew from its poses.
