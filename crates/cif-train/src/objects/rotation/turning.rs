@@ -42,8 +42,8 @@ pub(in super::super) fn turning<'a>(
     let best = tried.min_by(|a, b| a.cost.total_cmp(&b.cost))?;
     let best = seen.finely(seen.moved(best));
     let errors = shown.errors(&evidence, &best)?;
-    // What is no ball looks as one from a few sides, and its paint slides over it: of twelve globes the least margin is 2.8
-    // standard errors, of a bottle and a block at rest 2.0.
+    // What is no ball looks as one from a few sides, and its paint slides over it: of eleven globes the least margin is 2.8
+    // standard errors, of a bottle at rest in two captures 1.6 and 2.0.
     shown.turns(&evidence, &best).then(|| (shown.turning(&best), errors))
 }
 
