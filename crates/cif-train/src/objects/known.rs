@@ -91,9 +91,11 @@ impl KnownObjects {
             }
         }
         for (label, found) in &mut self.parts {
-            if let Some(Jointed { base, part, .. }) = found {
-                sets.push((format!("{TENSORS}{label}.base"), base));
-                sets.push((format!("{TENSORS}{label}.part"), part));
+            let Some(Jointed { base, part, second, .. }) = found else { continue };
+            sets.push((format!("{TENSORS}{label}.base"), base));
+            sets.push((format!("{TENSORS}{label}.part"), &mut part.gaussians));
+            if let Some(second) = second {
+                sets.push((format!("{TENSORS}{label}.second"), &mut second.gaussians));
             }
         }
         for (label, found) in &mut self.bending {
@@ -135,9 +137,8 @@ impl KnownObjects {
             ),
             _ => None,
         });
-        let of_parts = known.parts.values().flatten().map(|found| {
-            let last = found.values.last_key_value();
-            last.is_some_and(|(time, _)| *time < times)
+        let of_parts = known.parts.values().flatten().flat_map(|found| {
+            found.parts().map(|part| part.values.last_key_value().is_some_and(|(time, _)| *time < times))
         });
         let of_bending = known.bending.values().map(|found| found.shifts.are_sound(times));
         if !are_labels || !of_rigid.chain(of_parts).chain(of_bending).all(|fits| fits) {
@@ -166,14 +167,20 @@ mod tests {
     use cif_field::tracks::{JointKind, RotationEvidence};
     use glam::{DQuat, DVec3};
 
-    use super::super::parts::Hinge;
+    use super::super::parts::{Hinge, JointedPart};
     use super::*;
 
     fn part(error: f64) -> Jointed {
         let hinge = Hinge { kind: JointKind::Revolute, axis: DVec3::X, point: DVec3::ZERO };
         let gaussians = || Gaussians::zeros(1);
         let values = BTreeMap::from([(0, 0.0), (1, 0.5)]);
-        Jointed { base: gaussians(), part: gaussians(), hinge, values, errors: [error, 0.4] }
+        let on_joint = || JointedPart { gaussians: gaussians(), hinge, values: values.clone() };
+        Jointed {
+            base: gaussians(),
+            part: on_joint(),
+            second: Some(Box::new(on_joint())),
+            errors: [error, 0.4],
+        }
     }
 
     fn whole(error: f64) -> Found {
@@ -207,6 +214,26 @@ mod tests {
         let mut known = KnownObjects::default();
         known.insert_in_place(1, Some(InPlace::Jointed(part(0.2))));
         assert!(known.jointed(1).is_some());
+    }
+
+    #[test]
+    fn parts_come_back_as_they_were_saved_also_of_runs_that_knew_no_second_one() {
+        let mut known = KnownObjects::default();
+        known.insert_turning(1, part(0.1));
+        let (json, tensors) = known.saved();
+        let (json, tensors): (_, BTreeMap<_, _>) = (json.unwrap(), tensors.into_iter().collect());
+        let restored = |json: Value| KnownObjects::restored(json, &mut tensors.clone(), 1, 2);
+        let values = |known: &KnownObjects| -> Vec<BTreeMap<usize, f64>> {
+            known.parts[&1].iter().flat_map(Jointed::parts).map(|part| part.values.clone()).collect()
+        };
+        assert_eq!(values(&restored(json.clone()).unwrap()), values(&known));
+        assert_eq!(values(&known).len(), 2);
+        let mut older = json.clone();
+        older["parts"]["1"].as_object_mut().unwrap().remove("second").unwrap();
+        assert_eq!(values(&restored(older).unwrap()), values(&known)[..1]);
+        let mut late = json;
+        late["parts"]["1"]["second"]["values"]["2"] = Value::from(0.1);
+        assert!(restored(late).is_none(), "a value at a time that the capture does not have");
     }
 
     fn bending(knot: usize) -> Bending {

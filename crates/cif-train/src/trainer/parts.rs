@@ -1,5 +1,5 @@
-//! Objects with a part on a joint: found where an object is at rest but for a part, given Gaussians in two groups, of which
-//! that of the part moves on the joint.
+//! Objects with parts on joints: found where an object is at rest but for these, given Gaussians in groups, of which those of
+//! the parts move on the joints.
 
 use cif_field::Instance;
 use cif_field::tracks::{Joint, TrackGroup};
@@ -66,7 +66,7 @@ impl Trainer {
         failed.map_or(Ok(()), Err)
     }
 
-    /// Gives an object with a part groups for both.
+    /// Gives an object with parts groups for its base and each of them.
     pub(super) fn add_parts(&mut self, instance: &Instance, found: &Jointed) {
         let [with, without] = found.errors;
         let name = &instance.label;
@@ -74,15 +74,17 @@ impl Trainer {
             "{name} rests, but {} (error {with:.3} on pixels left out, {without:.3} without)",
             found.told()
         )));
-        let base = TrackGroup::of_instance(instance, found.hinge.point);
+        let base = TrackGroup::of_instance(instance, found.part.hinge.point);
         let base = self.add_group(found.base.clone(), base, &[]);
-        let times = &self.state.dataset.times;
-        let values: Vec<(f64, f64)> =
-            found.values.iter().map(|(time, value)| (times[*time], *value)).collect();
-        let joint = Joint { base, kind: found.hinge.kind, axis: found.hinge.axis };
-        let groups = self.state.field.tracks.as_ref().map_or(&[][..], |tracks| &tracks.groups);
-        let part = TrackGroup::jointed(name, found.hinge.point, joint, &values, groups);
-        let shares = vec![1.0; part.poses.len()];
-        self.add_group(found.part.clone(), part, &shares);
+        for part in found.parts() {
+            let times = &self.state.dataset.times;
+            let values: Vec<(f64, f64)> =
+                part.values.iter().map(|(time, value)| (times[*time], *value)).collect();
+            let joint = Joint { base, kind: part.hinge.kind, axis: part.hinge.axis };
+            let groups = self.state.field.tracks.as_ref().map_or(&[][..], |tracks| &tracks.groups);
+            let group = TrackGroup::jointed(name, part.hinge.point, joint, &values, groups);
+            let shares = vec![1.0; group.poses.len()];
+            self.add_group(part.gaussians.clone(), group, &shares);
+        }
     }
 }

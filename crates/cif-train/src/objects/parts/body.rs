@@ -1,4 +1,4 @@
-//! A body of two parts under way: a base, and a part that a joint moves; Gaussians, joint and values together.
+//! A body under way: a base, and a part that a joint moves, or two; Gaussians, joints and values together.
 
 use std::collections::BTreeMap;
 
@@ -83,70 +83,83 @@ pub(super) struct PosedObject<'a> {
     pub(super) up: Option<DVec3>,
 }
 
-/// A part of a body.
-pub(super) struct Part {
-    /// Joint that it is on.
+/// A joint on the base of a body.
+pub(super) struct JointOfBody {
+    /// In the frame of the object.
     pub(super) hinge: Hinge,
-    /// By Gaussian of the body, true for those of the part.
-    pub(super) members: Vec<bool>,
-    /// Values of the joint by time, radians or metres.
+    /// Values by time, radians or metres.
     pub(super) values: BTreeMap<usize, f64>,
+    /// Its value, of one that is searched for: -1 of the second of two.
+    pub(super) share: f64,
+    moments: Moments,
 }
 
-/// A base and, behind its Gaussians, those of a part on a joint; without a joint all of them are the base.
+impl JointOfBody {
+    pub(super) fn new(hinge: Hinge, values: BTreeMap<usize, f64>, share: f64) -> Self {
+        let moments = Moments { values: BTreeMap::new(), axis: Adam::new(3), point: Adam::new(3) };
+        Self { hinge, values, share, moments }
+    }
+
+    /// Its value at a time, between those that are known.
+    pub(super) fn value_at(&self, time: usize) -> f64 {
+        between(&self.values, time)
+    }
+}
+
+/// A base and, behind its Gaussians, those of parts on joints; without joints all of them are the base.
 pub(super) struct Body<'a> {
     object: PosedObject<'a>,
     pub(super) shape: Shape,
-    pub(super) hinge: Option<Hinge>,
-    /// Of the joint, by time.
-    pub(super) values: BTreeMap<usize, f64>,
-    moments: Moments,
+    pub(super) joints: Vec<JointOfBody>,
     rng: Pcg64,
 }
 
 impl<'a> Body<'a> {
-    /// A body of the Gaussians of a shape.
-    pub(super) fn new(object: PosedObject<'a>, shape: Shape, part: Option<Part>, rng: Pcg64) -> Self {
-        let (mut hinge, mut values) = (None, BTreeMap::new());
-        let shape = match part {
-            None => shape,
-            Some(Part { hinge: of, members, values: at }) => {
-                let still = |name| TrackGroup { deformed: false, ..TrackGroup::still(name, of.point) };
-                let pose = TrackPose { time: 0.0, translation: of.point, rotation: DQuat::IDENTITY };
-                let groups = vec![still("base"), TrackGroup { poses: vec![pose], ..still("part") }];
-                (hinge, values) = (Some(of), at);
-                shape.in_parts(Tracks { group_of: members.into_iter().map(u32::from).collect(), groups })
-            }
+    /// A body of the Gaussians of a shape, each of the base (0) or of the part of a joint, counted from 1.
+    pub(super) fn new(
+        object: PosedObject<'a>,
+        shape: Shape,
+        joints: Vec<JointOfBody>,
+        group_of: Vec<usize>,
+        rng: Pcg64,
+    ) -> Self {
+        let shape = if joints.is_empty() {
+            shape
+        } else {
+            let still = |name, pivot| TrackGroup { deformed: false, ..TrackGroup::still(name, pivot) };
+            let of_joint = |joint: &JointOfBody| {
+                let point = joint.hinge.point;
+                let pose = TrackPose { time: 0.0, translation: point, rotation: DQuat::IDENTITY };
+                TrackGroup { poses: vec![pose], ..still("part", point) }
+            };
+            let base = still("base", joints[0].hinge.point);
+            let groups = std::iter::once(base).chain(joints.iter().map(of_joint)).collect();
+            let group_of = group_of.into_iter().map(|group| group as u32).collect();
+            shape.in_parts(Tracks { group_of, groups })
         };
-        let moments = Moments { values: BTreeMap::new(), axis: Adam::new(3), point: Adam::new(3) };
-        Self { object, shape, hinge, values, moments, rng }
+        Self { object, shape, joints, rng }
     }
 
-    /// True for Gaussians of the part.
-    pub(super) fn part_rows(&self) -> Vec<bool> {
-        let rows = 0..self.shape.gaussians().len();
-        rows.map(|row| self.shape.part_of(row) == Some(1)).collect()
+    /// Group of each Gaussian: 0 of the base.
+    pub(super) fn groups(&self) -> Vec<usize> {
+        (0..self.shape.gaussians().len()).map(|row| self.shape.part_of(row).unwrap_or(0)).collect()
     }
 
-    /// Difference of the largest and the least value of the joint.
+    /// Difference of the largest and the least value of the first joint.
     pub(super) fn reach(&self) -> f64 {
-        let (low, high) = range(&self.values);
-        high - low
+        self.joints.first().map_or(0.0, |joint| {
+            let (low, high) = range(&joint.values);
+            high - low
+        })
     }
 
-    /// Value of the joint at a time, between those that are known.
-    pub(super) fn value_at(&self, time: usize) -> f64 {
-        between(&self.values, time)
-    }
-
-    /// Loss of a view with the joint at a value, by a shape of one's own.
-    pub(super) fn loss_with(&self, shape: &mut Shape, view: usize, level: usize, value: f64) -> f64 {
+    /// Loss of a view by a shape of one's own, with a value that is searched for, or those that the joints have.
+    pub(super) fn loss_with(&self, shape: &mut Shape, view: usize, level: usize, value: Option<f64>) -> f64 {
         let view = &self.object.views[view];
         let Some(pose) = self.object.base.get(&view.time_index) else { return 0.0 };
-        if let Some(hinge) = self.hinge {
-            let (turn, place) = hinge.pose(value);
-            shape.set_part(1, hinge.point, turn, place);
-        }
+        let of =
+            |joint: &JointOfBody| value.map_or(joint.value_at(view.time_index), |value| joint.share * value);
+        put(shape, &self.joints, of);
         shape.loss(&view.crops[level], pose, GREY, 1.0, false).value
     }
 
@@ -156,7 +169,7 @@ impl<'a> Body<'a> {
         let (mut sum, mut weights) = (0.0, 0.0);
         for view in views {
             let of = &self.object.views[*view];
-            sum += of.visible * self.loss_with(&mut shape, *view, level, self.value_at(of.time_index));
+            sum += of.visible * self.loss_with(&mut shape, *view, level, None);
             weights += of.visible;
         }
         sum / f64::max(weights, 1e-12)
@@ -188,24 +201,21 @@ impl<'a> Body<'a> {
         let view = &self.object.views[view];
         let time = view.time_index;
         let Some(pose) = self.object.base.get(&time) else { return };
-        let value = self.value_at(time);
-        if let Some(hinge) = self.hinge {
-            let (turn, place) = hinge.pose(value);
-            self.shape.set_part(1, hinge.point, turn, place);
-        }
+        put(&mut self.shape, &self.joints, |joint| joint.value_at(time));
         let background = std::array::from_fn(|_| self.rng.random::<f32>());
         self.shape.loss(&view.crops[level], pose, background, view.visible as f32, true);
         self.shape.step(rate);
-        if let Some(hinge) = self.hinge
-            && of_joint > 0.0
-        {
-            self.move_joint(hinge, time, value, of_joint);
+        if of_joint > 0.0 {
+            (0..self.joints.len()).for_each(|joint| self.move_joint(joint, time, of_joint));
         }
     }
 
-    /// Moves value, direction and place of the joint against the gradient of the last loss.
-    fn move_joint(&mut self, hinge: Hinge, time: usize, value: f64, rate: f64) {
-        let gradient = self.shape.part_gradient(0);
+    /// Moves value, direction and place of a joint against the gradient of the last loss.
+    fn move_joint(&mut self, joint: usize, time: usize, rate: f64) {
+        let PosedObject { size, up, .. } = self.object;
+        let gradient = self.shape.part_gradient(joint);
+        let joint = &mut self.joints[joint];
+        let (hinge, value) = (joint.hinge, joint.value_at(time));
         let (turn, _) = hinge.pose(value);
         let v_turn = turn * gradient.turn;
         let (of_value, of_axis, of_point) = match hinge.kind {
@@ -222,26 +232,34 @@ impl<'a> Body<'a> {
             }
         };
         let (mut axis, mut point, mut at) = (hinge.axis, hinge.point, value);
-        let unit = hinge.unit(self.object.size);
-        let moments = self.moments.values.entry(time).or_insert_with(|| Adam::new(1));
-        moments.step(std::iter::once(of_value), RATES[0] * unit * rate, |_, step| at -= step);
+        let moments = joint.moments.values.entry(time).or_insert_with(|| Adam::new(1));
+        let rate_of_value = RATES[0] * hinge.unit(size) * rate;
+        moments.step(std::iter::once(of_value), rate_of_value, |_, step| at -= step);
         let values = |v: DVec3| v.to_array().into_iter();
-        self.moments.axis.step(values(of_axis), RATES[1] * rate, |k, step| axis[k] -= step);
+        joint.moments.axis.step(values(of_axis), RATES[1] * rate, |k, step| axis[k] -= step);
         if hinge.kind == JointKind::Revolute {
-            let rate = RATES[2] * self.object.size * rate;
-            self.moments.point.step(values(of_point), rate, |k, step| point[k] -= step);
+            let rate = RATES[2] * size * rate;
+            joint.moments.point.step(values(of_point), rate, |k, step| point[k] -= step);
             // Along the axis it says nothing.
             point -= hinge.axis * hinge.axis.dot(point - hinge.point);
         }
-        if let Some(up) = self.object.up {
+        if let Some(up) = up {
             let along = hinge.axis.dot(up);
             axis += up * (along - axis.dot(up));
             if along.abs() > UPRIGHT {
                 axis = hinge.axis;
             }
         }
-        self.values.insert(time, at);
-        self.hinge = Some(Hinge { axis: axis.normalize(), point, ..hinge });
+        joint.values.insert(time, at);
+        joint.hinge = Hinge { axis: axis.normalize(), point, ..hinge };
+    }
+}
+
+/// Puts the parts of a shape where their joints have values.
+fn put(shape: &mut Shape, joints: &[JointOfBody], value: impl Fn(&JointOfBody) -> f64) {
+    for (k, joint) in joints.iter().enumerate() {
+        let (turn, place) = joint.hinge.pose(value(joint));
+        shape.set_part(k + 1, joint.hinge.point, turn, place);
     }
 }
 

@@ -1,16 +1,16 @@
-//! Guesses with Gaussians of their own: base, part, joint and values moved together, to the body that is kept.
+//! Guesses with Gaussians of their own: base, parts, joints and values moved together, to the body that is kept.
 
 use std::collections::BTreeMap;
 
 use cif_field::Gaussians;
 use cif_field::tracks::JointKind;
 use glam::{DQuat, DVec3};
-use serde::{Deserialize, Serialize};
+use serde::de::Error;
+use serde::{Deserialize, Deserializer, Serialize};
 
-use super::super::sequence::between;
 use super::super::shape::{Pose, Shape};
-use super::body::{Body, Hinge, Part, range};
-use super::guesses::{Guess, JointValues};
+use super::body::{Body, Hinge, JointOfBody, range};
+use super::guesses::{Cut, Guess, JointValues};
 use super::promise::LOOKS;
 use super::scope::Search;
 use super::search::search;
@@ -65,14 +65,16 @@ impl<'a> Search<'a> {
         budget: Budget,
         level: usize,
     ) -> Option<Fit<'a>> {
-        let hinge = guess.hinge;
-        let mut base = self.hull(self.base, None, budget.base)?;
-        base.fade(FAINT, |place| guess.has(place, 0.0));
-        let margin = 0.1 * self.size;
-        let inside = |place: DVec3| guess.has(place, margin);
-        let mut part = self.hull(&self.posed(hinge, values), Some(&inside), budget.part)?;
-        part.fade(FAINT, |place| !guess.has(place, 0.0));
-        let mut body = self.together(base, &part, hinge, values);
+        let joints = guess.joints(values);
+        let shapes = if let (Some(other), [first, second]) = (guess.cut.other(), &joints[..]) {
+            let each = (budget.base + budget.part) / 2;
+            [self.part(first, guess.cut, each)?, self.part(second, other, each)?]
+        } else {
+            let mut base = self.hull(self.base, None, budget.base)?;
+            base.fade(FAINT, |place| guess.cut.has(place, 0.0));
+            [base, self.part(&joints[0], guess.cut, budget.part)?]
+        };
+        let mut body = self.together(shapes, joints);
         body.steps(
             &self.views.train,
             budget.steps,
@@ -83,25 +85,32 @@ impl<'a> Search<'a> {
         Some(Fit { guess, body, loss })
     }
 
-    /// World from a part by time, with values of its joint.
-    pub(super) fn posed(&self, hinge: Hinge, values: &BTreeMap<usize, f64>) -> BTreeMap<usize, Pose> {
-        let posed = |(time, pose): (&usize, &Pose)| (*time, hinge.posed(pose, between(values, *time)));
+    /// Gaussians of what a cut has, as the part of a joint.
+    fn part(&self, joint: &JointOfBody, cut: Cut, count: usize) -> Option<Shape> {
+        let margin = 0.1 * self.size;
+        let inside = |place: DVec3| cut.has(place, margin);
+        let mut part = self.hull(&self.posed(joint), Some(&inside), count)?;
+        part.fade(FAINT, |place| !cut.has(place, 0.0));
+        Some(part)
+    }
+
+    /// World from the part of a joint, by time.
+    pub(super) fn posed(&self, joint: &JointOfBody) -> BTreeMap<usize, Pose> {
+        let posed = |(time, pose): (&usize, &Pose)| (*time, joint.hinge.posed(pose, joint.value_at(*time)));
         self.base.iter().map(posed).collect()
     }
 
-    /// A base and a part on a joint.
-    pub(super) fn together(
-        &self,
-        base: Shape,
-        part: &Shape,
-        hinge: Hinge,
-        values: &BTreeMap<usize, f64>,
-    ) -> Body<'a> {
-        let of_base = base.gaussians().len();
-        let members = (0..of_base + part.gaussians().len()).map(|row| row >= of_base).collect();
+    /// A body of the Gaussians of a base and of the part of a joint, or of those of two joints.
+    pub(super) fn together(&self, shapes: [Shape; 2], mut joints: Vec<JointOfBody>) -> Body<'a> {
+        let first = joints.len() - 1;
+        let of = |k: usize| vec![first + k; shapes[k].gaussians().len()];
+        let groups = [of(0), of(1)].concat();
         let times = self.times(usize::MAX);
-        let values = times.keys().map(|time| (*time, between(values, *time))).collect();
-        self.body(base.joined(part), Some(Part { hinge, members, values }))
+        for joint in &mut joints {
+            joint.values = times.keys().map(|time| (*time, joint.value_at(*time))).collect();
+        }
+        let [shape, other] = shapes;
+        self.body(shape.joined(&other), joints, groups)
     }
 
     /// The joint of a body and its values, a hinge where it explains most: it was guessed at a side of the hull, which
@@ -112,9 +121,12 @@ impl<'a> Search<'a> {
         mut body: Body<'a>,
         level: usize,
     ) -> (Hinge, BTreeMap<usize, f64>) {
-        let hinge = body.hinge.unwrap_or(guess.hinge);
+        let (hinge, own) = body
+            .joints
+            .first()
+            .map_or_else(|| (guess.hinge, BTreeMap::new()), |joint| (joint.hinge, joint.values.clone()));
         if guess.values.is_round || hinge.kind == JointKind::Prismatic {
-            return (hinge, body.values);
+            return (hinge, own);
         }
         let times = self.times(LOOKS);
         let (first, second) = hinge.axis.any_orthonormal_pair();
@@ -122,21 +134,22 @@ impl<'a> Search<'a> {
         for (i, j) in (-PLACES..=PLACES).flat_map(|i| (-PLACES..=PLACES).map(move |j| (i, j))) {
             let aside = PLACE * self.size * (f64::from(i) * first + f64::from(j) * second);
             let moved = Hinge { point: hinge.point + aside, ..hinge };
-            body.hinge = Some(moved);
+            body.joints.iter_mut().for_each(|joint| joint.hinge = moved);
             let (values, loss) = search(&body, &times, &guess.values, level);
             if loss < best.2 {
                 best = (moved, values, loss);
             }
         }
         let (placed, values, _) = best;
-        if placed == hinge { (hinge, body.values) } else { (placed, values) }
+        if placed == hinge { (hinge, own) } else { (placed, values) }
     }
 
     /// A fit whose values were searched for again at all times, and moved on from there.
     pub(super) fn finely_valued(&self, fit: Fit<'a>, steps: usize, level: usize) -> Fit<'a> {
         let Fit { guess, mut body, .. } = fit;
         let all = self.times(usize::MAX);
-        let (low, high) = body.values.values().fold((0.0_f64, 0.0_f64), |(l, h), v| (l.min(*v), h.max(*v)));
+        let of = body.joints.first().into_iter().flat_map(|joint| joint.values.values());
+        let (low, high) = of.fold((0.0_f64, 0.0_f64), |(l, h), v| (l.min(*v), h.max(*v)));
         let widened = 0.25 * (high - low) + 0.05 * guess.hinge.unit(self.size);
         let count = 25;
         let finer: Vec<f64> = (0..count)
@@ -149,11 +162,13 @@ impl<'a> Search<'a> {
         let mut shape = body.shape.copied();
         for (time, value) in found {
             let views = &all[&time];
-            let mut loss = |value: f64| {
+            let mut loss = |value: Option<f64>| {
                 views.iter().map(|view| body.loss_with(&mut shape, *view, level, value)).sum::<f64>()
             };
-            if loss(value) < loss(body.value_at(time)) {
-                body.values.insert(time, value);
+            if loss(Some(value)) < loss(None) {
+                for joint in &mut body.joints {
+                    joint.values.insert(time, joint.share * value);
+                }
             }
         }
         body.steps(&self.views.train, steps, level, |share| {
@@ -173,71 +188,118 @@ impl<'a> Search<'a> {
 
     /// What a body shows: at the value 0 as it is seen first.
     pub(super) fn jointed(&self, body: &Body<'a>, errors: [f64; 2]) -> Option<Jointed> {
-        let hinge = body.hinge?;
-        let start = *body.values.values().next()?;
-        let members = body.part_rows();
+        let groups = body.groups();
         let g = body.shape.gaussians();
-        let kept = |of_part: bool| {
+        let kept = |group: usize| {
             let mut own = g.clone();
-            let is_selected = |row: usize| members[row] == of_part && g.opacity_logits[row] > SEEN;
+            let is_selected = |row: usize| groups[row] == group && g.opacity_logits[row] > SEEN;
             own.retain(&(0..g.len()).map(is_selected).collect::<Vec<_>>());
             own
         };
-        let mut part = kept(true);
-        let (turn, place) = hinge.pose(start);
-        for (mean, quaternion) in part.means.iter_mut().zip(&mut part.quaternions) {
-            let moved = turn * (DVec3::from_array(mean.map(f64::from)) - hinge.point) + place;
-            *mean = moved.as_vec3().to_array();
-            let [w, x, y, z] = quaternion.map(f64::from);
-            let turned = turn * DQuat::from_xyzw(x, y, z, w);
-            *quaternion = [turned.w, turned.x, turned.y, turned.z].map(|value| value as f32);
-        }
-        // It opens towards positive values.
-        let most = body
-            .values
-            .values()
-            .map(|value| value - start)
-            .fold(0.0, |most: f64, value| if value.abs() > most.abs() { value } else { most });
-        let sign = if most < 0.0 { -1.0 } else { 1.0 };
-        let values = self.base.keys().map(|time| (*time, sign * (body.value_at(*time) - start))).collect();
-        let hinge = Hinge { axis: sign * hinge.axis, ..hinge };
-        Some(Jointed { base: kept(false), part, hinge, values, errors })
+        let part = |(k, joint): (usize, &JointOfBody)| {
+            let mut gaussians = kept(k + 1);
+            let hinge = joint.hinge;
+            let start = *joint.values.values().next()?;
+            let (turn, place) = hinge.pose(start);
+            for (mean, quaternion) in gaussians.means.iter_mut().zip(&mut gaussians.quaternions) {
+                let moved = turn * (DVec3::from_array(mean.map(f64::from)) - hinge.point) + place;
+                *mean = moved.as_vec3().to_array();
+                let [w, x, y, z] = quaternion.map(f64::from);
+                let turned = turn * DQuat::from_xyzw(x, y, z, w);
+                *quaternion = [turned.w, turned.x, turned.y, turned.z].map(|value| value as f32);
+            }
+            // It opens towards positive values.
+            let values = joint.values.values().map(|value| value - start);
+            let most =
+                values.fold(0.0, |most: f64, value| if value.abs() > most.abs() { value } else { most });
+            let sign = if most < 0.0 { -1.0 } else { 1.0 };
+            let of = |time: &usize| (*time, sign * (joint.value_at(*time) - start));
+            let hinge = Hinge { axis: sign * hinge.axis, ..hinge };
+            Some(JointedPart { gaussians, hinge, values: self.base.keys().map(of).collect() })
+        };
+        let mut parts = body.joints.iter().enumerate().map(part);
+        Some(Jointed {
+            base: kept(0),
+            part: parts.next()??,
+            second: parts.next().flatten().map(Box::new),
+            errors,
+        })
     }
 }
 
-/// An object at rest and a part of it that moves, in the world.
+/// An object at rest and a part of it that moves, or two, in the world.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) struct Jointed {
     #[serde(skip)]
     pub(crate) base: Gaussians,
-    /// As at the value 0.
-    #[serde(skip)]
-    pub(crate) part: Gaussians,
-    pub(crate) hinge: Hinge,
-    /// Radians or metres, by time.
-    pub(crate) values: BTreeMap<usize, f64>,
-    /// Errors on pixels left out: with the joint, and without.
+    #[serde(flatten)]
+    pub(crate) part: JointedPart,
+    #[serde(default)]
+    pub(crate) second: Option<Box<JointedPart>>,
+    /// Errors on pixels left out: with the joints, and without.
     pub(crate) errors: [f64; 2],
 }
 
+/// A part on a joint.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(crate) struct JointedPart {
+    /// As at the value 0.
+    #[serde(skip)]
+    pub(crate) gaussians: Gaussians,
+    pub(crate) hinge: Hinge,
+    /// Radians or metres, by time.
+    #[serde(deserialize_with = "by_time")]
+    pub(crate) values: BTreeMap<usize, f64>,
+}
+
+/// Values by time from JSON, whose keys are text; what is flattened has to say so.
+fn by_time<'de, D: Deserializer<'de>>(values: D) -> Result<BTreeMap<usize, f64>, D::Error> {
+    let parsed = |(time, value): (String, f64)| Ok((time.parse().map_err(D::Error::custom)?, value));
+    BTreeMap::<String, f64>::deserialize(values)?.into_iter().map(parsed).collect()
+}
+
 impl Jointed {
+    /// Its parts.
+    pub(crate) fn parts(&self) -> impl Iterator<Item = &JointedPart> {
+        std::iter::once(&self.part).chain(self.second.as_deref())
+    }
+
+    /// The same to be changed.
+    pub(crate) fn parts_mut(&mut self) -> impl Iterator<Item = &mut JointedPart> {
+        std::iter::once(&mut self.part).chain(self.second.as_deref_mut())
+    }
+
     /// The same elsewhere.
     pub(super) fn moved(mut self, by: DVec3) -> Self {
-        for mean in self.base.means.iter_mut().chain(&mut self.part.means) {
-            *mean = (DVec3::from_array(mean.map(f64::from)) + by).as_vec3().to_array();
+        let shift = |gaussians: &mut Gaussians| {
+            for mean in &mut gaussians.means {
+                *mean = (DVec3::from_array(mean.map(f64::from)) + by).as_vec3().to_array();
+            }
+        };
+        shift(&mut self.base);
+        for part in self.parts_mut() {
+            shift(&mut part.gaussians);
+            part.hinge.point += by;
         }
-        self.hinge.point += by;
         self
     }
 
-    /// The joint in words, with the range of its values.
+    /// The joints in words, with the ranges of their values.
     pub(crate) fn told(&self) -> String {
-        let (low, high) = range(&self.values);
-        match self.hinge.kind {
-            JointKind::Revolute => {
-                format!("a part turns on a hinge, {:.0} to {:.0} deg", low.to_degrees(), high.to_degrees())
+        let of = |(k, part): (usize, &JointedPart)| {
+            let (low, high) = range(&part.values);
+            let name = if k == 0 { "a part" } else { "another part" };
+            match part.hinge.kind {
+                JointKind::Revolute => {
+                    format!(
+                        "{name} turns on a hinge, {:.0} to {:.0} deg",
+                        low.to_degrees(),
+                        high.to_degrees()
+                    )
+                }
+                JointKind::Prismatic => format!("{name} slides, {low:.3} to {high:.3}"),
             }
-            JointKind::Prismatic => format!("a part slides, {low:.3} to {high:.3}"),
-        }
+        };
+        self.parts().enumerate().map(of).collect::<Vec<_>>().join(" and ")
     }
 }

@@ -1,10 +1,12 @@
-//! Joints that an object may have, by the box around it: flaps at its edges, drawers, halves and slabs that turn.
+//! Joints that an object may have, by the box around it: flaps at its edges, drawers, halves and slabs that turn, scissors.
+
+use std::collections::BTreeMap;
 
 use cif_field::tracks::JointKind;
 use glam::DVec3;
 
 use super::super::plane::Plane;
-use super::body::Hinge;
+use super::body::{Hinge, JointOfBody};
 
 /// Thickness of flaps, drawers and slabs that turn, of the box.
 const FLAPS: [f64; 3] = [0.15, 0.35, 0.55];
@@ -34,10 +36,23 @@ pub(super) struct Sides {
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Guess {
     pub(super) hinge: Hinge,
-    /// The part is what is beyond this plane: its normal, and its offset.
-    pub(super) cut: (DVec3, f64),
+    /// What is of the part.
+    pub(super) cut: Cut,
     /// Values that are tried at each time.
     pub(super) values: JointValues,
+}
+
+/// A side of a plane: its normal, and its offset.
+pub(super) type Side = (DVec3, f64);
+
+/// What of an object is of a part.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Cut {
+    /// What is beyond a plane.
+    Beyond(Side),
+    /// What is beyond both of two planes or of neither; all else is a second part, which turns the other way, as the blades
+    /// of scissors.
+    Crossed([Side; 2]),
 }
 
 /// Values of a joint that are tried.
@@ -57,9 +72,35 @@ impl JointValues {
 }
 
 impl Guess {
+    /// Its joints, two where there is a second part, at searched values.
+    pub(super) fn joints(&self, values: &BTreeMap<usize, f64>) -> Vec<JointOfBody> {
+        let of = |share: f64| {
+            let values = values.iter().map(|(time, value)| (*time, share * value)).collect();
+            JointOfBody::new(self.hinge, values, share)
+        };
+        if self.cut.other().is_some() { vec![of(1.0), of(-1.0)] } else { vec![of(1.0)] }
+    }
+}
+
+impl Cut {
     /// True where a place belongs to the part, widened by a margin.
     pub(super) fn has(&self, place: DVec3, margin: f64) -> bool {
-        self.cut.0.dot(place) >= self.cut.1 - margin
+        let beyond = |(normal, offset): &Side| normal.dot(place) - offset;
+        match self {
+            Self::Beyond(side) => beyond(side) >= -margin,
+            Self::Crossed(sides) => {
+                let [a, b] = [0, 1].map(|k| beyond(&sides[k]));
+                (a >= -margin && b >= -margin) || (a <= margin && b <= margin)
+            }
+        }
+    }
+
+    /// What the second part has; `None` where there is none.
+    pub(super) fn other(&self) -> Option<Self> {
+        match self {
+            Self::Beyond(_) => None,
+            Self::Crossed([first, (normal, offset)]) => Some(Self::Crossed([*first, (-*normal, -offset)])),
+        }
     }
 }
 
@@ -91,17 +132,20 @@ impl Sides {
                 best = axes;
             }
         }
-        let ranges = best.map(|axis| range(places, axis));
-        Self { axes: best, low: ranges.map(|[low, _]| low), high: ranges.map(|[_, high]| high) }
+        Self::of(best, places)
+    }
+
+    /// The box around places with sides along unit directions.
+    fn of(axes: [DVec3; 3], places: &[DVec3]) -> Self {
+        let ranges = axes.map(|axis| range(places, axis));
+        Self { axes, low: ranges.map(|[low, _]| low), high: ranges.map(|[_, high]| high) }
     }
 
     /// The box around places with its sides turned about its last axis.
     pub(super) fn turned(&self, angle: f64, places: &[DVec3]) -> Self {
         let [first, second, up] = self.axes;
         let (sine, cosine) = angle.sin_cos();
-        let axes = [cosine * first + sine * second, cosine * second - sine * first, up];
-        let ranges = axes.map(|axis| range(places, axis));
-        Self { axes, low: ranges.map(|[low, _]| low), high: ranges.map(|[_, high]| high) }
+        Self::of([cosine * first + sine * second, cosine * second - sine * first, up], places)
     }
 
     fn extent(&self, axis: usize) -> f64 {
@@ -139,12 +183,13 @@ pub(super) fn guesses(sides: &Sides, stands: Option<&Plane>) -> Vec<Guess> {
         let normal = sign * sides.axes[face];
         let outer = if sign > 0.0 { sides.high[face] } else { -sides.low[face] };
         let extent = sides.extent(face);
-        let cut = |share: f64| (normal, outer - share * extent);
+        let beyond = |share: f64| outer - share * extent;
+        let cut = |share: f64| Cut::Beyond((normal, beyond(share)));
         let others: Vec<usize> = (0..3).filter(|axis| *axis != face).collect();
         for share in FLAPS {
             for (side, towards) in others.iter().flat_map(|axis| [(*axis, 1.0), (*axis, -1.0)]) {
                 let mut at = sides.middle();
-                at[face] = sign * cut(share).1;
+                at[face] = sign * beyond(share);
                 at[side] = if towards > 0.0 { sides.high[side] } else { sides.low[side] };
                 let hinge = revolute(normal.cross(towards * sides.axes[side]), sides.point(at));
                 let values = JointValues::open(degrees(-30.0, 150.0, 13));
@@ -174,9 +219,43 @@ pub(super) fn guesses(sides: &Sides, stands: Option<&Plane>) -> Vec<Guess> {
                 at[face] = sides.low[face] + share * extent;
                 let hinge = revolute(sides.axes[axis], sides.point(at));
                 let values = JointValues::open(degrees(-120.0, 120.0, 13));
-                all.push(Guess { hinge, cut: (normal, at[face]), values });
+                all.push(Guess { hinge, cut: Cut::Beyond((normal, at[face])), values });
+                // Of scissors both blades turn, each by half of that.
+                let across = 3 - face - axis;
+                let crossed = Cut::Crossed([(normal, at[face]), (sides.axes[across], at[across])]);
+                let values = JointValues::open(degrees(-60.0, 60.0, 13));
+                all.push(Guess { hinge, cut: crossed, values });
             }
         }
     }
     all
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cut_through_both_planes_leaves_a_second_part_that_turns_the_other_way() {
+        let sides = Sides { axes: [DVec3::X, DVec3::Y, DVec3::Z], low: [-1.0; 3], high: [1.0, 3.0, 1.0] };
+        let all = guesses(&sides, None);
+        let crossed = |guess: &&Guess| {
+            let hinge = guess.hinge;
+            guess.cut.other().is_some() && hinge.axis == DVec3::Z && hinge.point == DVec3::Y
+        };
+        let guess = all.iter().find(crossed).unwrap();
+        let corners = [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)];
+        let has =
+            |cut: &Cut, margin: f64| corners.map(|(x, y)| cut.has(DVec3::new(0.5 * x, 1.0 + y, 0.3), margin));
+        let other = guess.cut.other().unwrap();
+        assert_eq!(has(&guess.cut, 0.0), [true, false, false, true]);
+        assert_eq!(has(&other, 0.0), [false, true, true, false]);
+        assert_eq!(has(&guess.cut, 0.6), [true; 4], "widened");
+        let joints = guess.joints(&BTreeMap::from([(3, 0.5)]));
+        let values: Vec<f64> = joints.iter().map(|joint| joint.value_at(3)).collect();
+        assert_eq!(values, [0.5, -0.5]);
+        assert!(
+            all.iter().any(|guess| guess.cut.other().is_none() && guess.joints(&BTreeMap::new()).len() == 1)
+        );
+    }
 }

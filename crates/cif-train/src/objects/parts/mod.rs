@@ -3,7 +3,7 @@
 //! An object is first made of Gaussians that do not move in its frame: as it looks at all times, and as it looks at the
 //! times in a row that are most alike, say while its lid is closed. Where the first leave residuals that the second do
 //! not, joints are guessed by the box around the second, and the values of each are searched for at some times with
-//! these Gaussians cut in two. The best of the joints get Gaussians for base and part, and are moved together with values
+//! these Gaussians cut in two, of scissors as two parts that turn against each other. The best of the joints get Gaussians for base and part, and are moved together with values
 //! and axis against the pictures. What wins must explain pixels that were left out better than the static Gaussians do, and
 //! about as well as Gaussians that bend, or the object deforms.
 //!
@@ -36,7 +36,10 @@ use rayon::prelude::*;
 
 pub(crate) use self::bending::Bending;
 pub(super) use self::body::Hinge;
+use self::body::JointOfBody;
 pub(crate) use self::fits::Jointed;
+#[cfg(test)]
+pub(super) use self::fits::JointedPart;
 use self::fits::{Budget, FINELY, Fit, keep_kinds};
 use self::guesses::Guess;
 use self::scope::Search;
@@ -101,12 +104,13 @@ pub(super) fn turning_ball(object: Object<'_>) -> Result<Option<Jointed>, TrainE
     let views = (0..object.views.len()).filter(is_shown).collect();
     let search = Search::new(object, &base, SplitViews::whole(views));
     let hinge = Hinge { kind: JointKind::Revolute, axis, point: DVec3::ZERO };
+    let joints = vec![JointOfBody::new(hinge, angles, 1.0)];
     let is_ball = |place: DVec3| place.length() < ball.radius;
     let is_stand = |place: DVec3| !is_ball(place) && search.is_within(place);
     let stand = search.hull(&base, Some(&is_stand), FINELY.base);
-    let turned = search.hull(&search.posed(hinge, &angles), Some(&is_ball), FINELY.part);
+    let turned = search.hull(&search.posed(&joints[0]), Some(&is_ball), FINELY.part);
     let Some((stand, turned)) = stand.zip(turned) else { return Ok(None) };
-    let mut body = search.together(stand, &turned, hinge, &angles);
+    let mut body = search.together([stand, turned], joints);
     // Light, which stays where it is, would pull the joint back.
     body.steps(&search.views.train, 2 * FINELY.steps, 0, |share| (0.1_f64.powf(share), 0.0));
     phases.check()?;
@@ -118,7 +122,7 @@ pub(super) fn turning_ball(object: Object<'_>) -> Result<Option<Jointed>, TrainE
         rows.retain(&kept);
     };
     keep(&mut found.base, &|distance| distance > 1.0);
-    keep(&mut found.part, &|distance| distance < OF_BALL);
+    keep(&mut found.part.gaussians, &|distance| distance < OF_BALL);
     Ok(Some(found.moved(ball.centre)))
 }
 
@@ -160,11 +164,11 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<In
     let Some(rough) = search.rigid(train, GAUSSIANS, STEPS, level) else { return Ok(None) };
     let uncut = rough.mean_loss(train, level);
     phases.check()?;
-    let Some((closed, still)) = search.closed(GAUSSIANS, STEPS, level) else { return Ok(None) };
-    if uncut <= ALIKE * closed.mean_loss(&still, level) {
+    let Some((closed, alike)) = search.closed(GAUSSIANS, STEPS, level) else { return Ok(None) };
+    if uncut <= ALIKE * closed.mean_loss(&alike, level) {
         return Ok(None);
     }
-    let tried = search.tried(&closed, &still);
+    let tried = search.tried(&closed, &alike);
     if tried.is_empty() {
         return Ok(None);
     }
@@ -209,15 +213,17 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<In
     let Some(best) = fine.first().map(|fit| fit.loss) else { return Ok(None) };
     // A hinge far away does what a slide does; nothing slides out of what holds it.
     let is_simple = |fit: &Fit<'_>| {
-        let slides = fit.body.hinge.is_some_and(|hinge| hinge.kind == JointKind::Prismatic);
+        let slides = fit.guess.hinge.kind == JointKind::Prismatic;
         fit.loss <= SIMPLE * best && slides && fit.body.reach() <= search.size
     };
     let taken = fine.iter().position(is_simple).unwrap_or(0);
-    let Fit { body, loss: error, .. } = fine.swap_remove(taken);
-    if error > GAIN * still {
+    let found = fine.swap_remove(taken);
+    if found.loss > GAIN * still {
         return Ok(None);
     }
-    let bending = search.bending().filter(|bending| bending.error < DEFORMS * error);
-    let jointed = || search.finished(body, [error, still]).map(InPlace::Jointed);
-    Ok(bending.map(InPlace::Bends).or_else(jointed))
+    if let Some(bending) = search.bending().filter(|bending| bending.error < DEFORMS * found.loss) {
+        return Ok(Some(InPlace::Bends(bending)));
+    }
+    let Fit { body, loss: error, .. } = found;
+    Ok(search.finished(body, [error, still]).map(InPlace::Jointed))
 }

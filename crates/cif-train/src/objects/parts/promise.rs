@@ -7,7 +7,7 @@ use rand::RngExt;
 use rayon::prelude::*;
 
 use super::super::view::Seen;
-use super::body::{Body, Part};
+use super::body::Body;
 use super::guesses::{Guess, JointValues, Sides, guesses};
 use super::scope::Search;
 use super::search::search;
@@ -47,49 +47,67 @@ impl<'a> Search<'a> {
     /// Guesses about static Gaussians with their values, best first; none where none promises anything. The views are those
     /// that the Gaussians were made from.
     pub(super) fn tried(&self, closed: &Body<'a>, still: &[usize]) -> Vec<TriedGuess> {
-        let means = &closed.shape.gaussians().means;
-        let places: Vec<DVec3> = means.iter().map(|mean| DVec3::from_array(mean.map(f64::from))).collect();
         let carved = self.carved(still);
-        let inside = if carved.len() < FEWEST_INSIDE { &places } else { &carved };
-        let plane = self.object.surroundings.plane;
-        let up = self.up.unwrap_or(DVec3::Z);
-        let sides = Sides::around(inside, up);
-        let (times, level) = (self.times(LOOKS), self.level());
-        let try_one = |guess: Guess| {
-            let members: Vec<bool> = places.iter().map(|place| guess.has(*place, 0.0)).collect();
-            let share = members.iter().filter(|member| **member).count() as f64 / members.len() as f64;
-            if !(PART[0]..=PART[1]).contains(&share) {
-                return None;
-            }
-            let part = Part { hinge: guess.hinge, members, values: BTreeMap::new() };
-            let body = self.body(closed.shape.copied(), Some(part));
-            let (values, loss) = search(&body, &times, &guess.values, level);
-            Some(TriedGuess { guess, values, loss })
-        };
-        let try_all =
-            |sides: &Sides| -> Vec<_> { guesses(sides, plane).into_par_iter().filter_map(try_one).collect() };
-        let mut tried = try_all(&sides);
-        let (_, uncut) = search(closed, &times, &JointValues::open(vec![0.0]), level);
+        let inside = if carved.len() < FEWEST_INSIDE { closed.shape.centres() } else { carved };
+        let sides = Sides::around(&inside, self.up.unwrap_or(DVec3::Z));
+        let stands = self.object.surroundings.plane;
+        let mut tried = self.tried_of(closed, guesses(&sides, stands));
         let best = tried.iter().map(|tried| tried.loss).fold(f64::INFINITY, f64::min);
-        if best > PROMISE * uncut {
+        if best > PROMISE * self.uncut(closed) {
             return Vec::new();
         }
         if self.one_camera {
             // The hull of few directions hardly shows how the box is turned.
             for degrees in TURNS {
-                tried.extend(try_all(&sides.turned(degrees.to_radians(), inside)));
+                let turned = sides.turned(degrees.to_radians(), &inside);
+                tried.extend(self.tried_of(closed, guesses(&turned, stands)));
             }
         }
+        self.distinct(tried)
+    }
+
+    /// Guesses about a body with their values.
+    fn tried_of(&self, body: &Body<'a>, guesses: Vec<Guess>) -> Vec<TriedGuess> {
+        let (times, level) = (self.times(LOOKS), self.level());
+        let try_one = |guess: Guess| {
+            let body = self.cut(body, &guess)?;
+            let (values, loss) = search(&body, &times, &guess.values, level);
+            Some(TriedGuess { guess, values, loss })
+        };
+        guesses.into_par_iter().filter_map(try_one).collect()
+    }
+
+    /// Mean loss per view of a body as it is.
+    fn uncut(&self, body: &Body<'a>) -> f64 {
+        search(body, &self.times(LOOKS), &JointValues::open(vec![0.0]), self.level()).1
+    }
+
+    /// Of guesses about one axis the best, best first.
+    fn distinct(&self, mut tried: Vec<TriedGuess>) -> Vec<TriedGuess> {
         tried.sort_by(|a, b| a.loss.total_cmp(&b.loss));
-        // Of joints about one axis the best.
         let mut distinct: Vec<TriedGuess> = Vec::new();
         for found in tried {
-            let hinge = found.guess.hinge;
-            if !distinct.iter().any(|other| hinge.is_like(&other.guess.hinge, ALIKE * self.size)) {
+            let Guess { hinge, cut, .. } = found.guess;
+            let is_like = |other: &TriedGuess| {
+                hinge.is_like(&other.guess.hinge, ALIKE * self.size)
+                    && cut.other().is_some() == other.guess.cut.other().is_some()
+            };
+            if !distinct.iter().any(is_like) {
                 distinct.push(found);
             }
         }
         distinct
+    }
+
+    /// A static body with what a guess cuts of it as a part at the value 0, or two; `None` where that is too little or too
+    /// much.
+    fn cut(&self, body: &Body<'a>, guess: &Guess) -> Option<Body<'a>> {
+        let joints = guess.joints(&BTreeMap::new());
+        let other = if joints.len() > 1 { 2 } else { 0 };
+        let group = |place| if guess.cut.has(place, 0.0) { 1 } else { other };
+        let groups: Vec<usize> = body.shape.centres().into_iter().map(group).collect();
+        let share = groups.iter().filter(|group| **group == 1).count() as f64 / groups.len() as f64;
+        (PART[0]..=PART[1]).contains(&share).then(|| self.body(body.shape.copied(), joints, groups))
     }
 
     /// Places that some views which show the object well have inside its mask, above what it stands on.

@@ -12,7 +12,7 @@ use super::super::shape::{Pose, Shape};
 use super::super::split::{SplitViews, times_of};
 use super::super::view::{is_one_camera, median};
 use super::bending::Bending;
-use super::body::{Body, Part, PosedObject};
+use super::body::{Body, JointOfBody, PosedObject};
 
 /// Most views of a time that values are searched on.
 const VIEWS: usize = 2;
@@ -79,10 +79,10 @@ impl<'a> Search<'a> {
         Some(shape)
     }
 
-    /// The Gaussians of a shape as the object, with a part where it has one.
-    pub(super) fn body(&self, shape: Shape, part: Option<Part>) -> Body<'a> {
+    /// The Gaussians of a shape as the object with joints, each Gaussian of the base (0) or of the part of a joint.
+    pub(super) fn body(&self, shape: Shape, joints: Vec<JointOfBody>, group_of: Vec<usize>) -> Body<'a> {
         let Search { object, base, size, up, .. } = *self;
-        Body::new(PosedObject { views: object.views, base, size, up }, shape, part, object.rng())
+        Body::new(PosedObject { views: object.views, base, size, up }, shape, joints, group_of, object.rng())
     }
 
     /// The object without parts, as some views show it: with a number of Gaussians, after some steps.
@@ -95,7 +95,7 @@ impl<'a> Search<'a> {
     ) -> Option<Body<'a>> {
         let times = views.iter().map(|view| self.object.views[*view].time_index);
         let poses = times.filter_map(|time| Some((time, *self.base.get(&time)?))).collect();
-        let mut body = self.body(self.hull(&poses, None, gaussians)?, None);
+        let mut body = self.body(self.hull(&poses, None, gaussians)?, Vec::new(), Vec::new());
         body.steps(views, steps, level, |share| (if share < 0.5 { 1.0 } else { 0.5 }, 0.0));
         Some(body)
     }

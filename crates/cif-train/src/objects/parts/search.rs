@@ -23,7 +23,7 @@ pub(super) fn search(
     let mut table: Vec<Vec<f64>> = Vec::with_capacity(times.len());
     for views in times.values() {
         let mut mean = |value: &f64| -> f64 {
-            let of = views.iter().map(|view| body.loss_with(&mut shape, *view, level, *value));
+            let of = views.iter().map(|view| body.loss_with(&mut shape, *view, level, Some(*value)));
             of.sum::<f64>() / views.len().max(1) as f64
         };
         table.push(values.iter().map(&mut mean).collect());
