@@ -212,8 +212,8 @@ pub struct MotionConfig {
     /// True where objects that are rigid move by a trained pose per time instead of the network; needs `guidance`;
     /// default true.
     pub rigid: bool,
-    /// True where parts of objects that turn on a hinge or slide are looked for, which takes some seconds per object;
-    /// needs `rigid`. A ball that turns on a stand is looked for whatever this says. Default true; false in `draft` and
+    /// True where parts of objects that turn on a hinge or slide, and blades of scissors, are looked for, which takes some
+    /// seconds per object; needs `rigid`. A ball that turns on a stand is looked for whatever this says. Default true; false in `draft` and
     /// `paper`.
     pub parts: bool,
     /// Motion of objects, by label, that need not be found: `rigid` or `free`. Default: none is told.

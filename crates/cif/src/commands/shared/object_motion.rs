@@ -97,7 +97,7 @@ impl std::fmt::Display for ObjectMotion {
                 f.write_str(if *hidden { ", hidden at some times" } else { "" })
             }
             Self::Parts { joints } => {
-                write!(f, "{} parts", joints.len() + 1)?;
+                f.write_str("parts")?;
                 for JointMotion { joint, axis: [x, y, z], range: [low, high], .. } in joints {
                     let unit = if *joint == JointKind::Revolute { " deg" } else { "" };
                     let digits = if *joint == JointKind::Revolute { 1 } else { 3 };
