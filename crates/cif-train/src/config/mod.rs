@@ -213,8 +213,8 @@ pub struct MotionConfig {
     /// default true.
     pub rigid: bool,
     /// True where parts of objects that turn on a hinge or slide, and blades of scissors, are looked for, which takes some
-    /// seconds per object; needs `rigid`. A ball that turns on a stand is looked for whatever this says. Default true; false in `draft` and
-    /// `paper`.
+    /// seconds per object; needs `rigid`. A ball that turns on a stand is looked for whatever this says. Default true;
+    /// false in `draft` and `paper`.
     pub parts: bool,
     /// Motion of objects, by label, that need not be found: `rigid` or `free`. Default: none is told.
     pub of: BTreeMap<String, ObjectMotion>,
