@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use glam::{DQuat, DVec3};
+use glam::DVec3;
 
 use super::fit::Fit;
 use super::mend::settled;
@@ -109,7 +109,7 @@ fn is_missed(fit: &Fit<'_>, views: &[usize], led: &[Pose]) -> bool {
     };
     let behind = |view: &ObjectView| {
         let forward = view.camera.camera_from_world.rotation.row(2);
-        Pose { rotation: DQuat::IDENTITY, translation: view.camera.centre() - 10.0 * fit.size() * forward }
+        Pose::at(view.camera.centre() - 10.0 * fit.size() * forward)
     };
     let unseen = loss(&behind);
     led.iter().all(|pose| loss(&|_| *pose) > MISSED * unseen)

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use cif_field::tracks::RotationEvidence;
-use glam::{DQuat, DVec3};
+use glam::DVec3;
 use rand_pcg::Pcg64;
 use rayon::prelude::*;
 
@@ -244,21 +244,20 @@ impl<'a> Object<'a> {
 
     /// Where an object is followed from to other times of its path, among `times`; `None` without any.
     pub(super) fn starts(&self, path: &BTreeMap<usize, DVec3>, times: &[usize]) -> Option<Starts> {
-        let at = |place: DVec3| Pose { rotation: DQuat::IDENTITY, translation: place };
         let mut rests = self.runs_at_rest(path);
         rests.iter_mut().for_each(|rest| rest.retain(|time| times.contains(time)));
         rests.sort_by_key(|rest| std::cmp::Reverse(rest.len()));
         let at_rest = if rests.is_empty() { Vec::new() } else { rests.remove(0) };
         let reference = self.best_seen(if at_rest.is_empty() { times } else { &at_rest }.iter().copied())?;
-        let mut poses = BTreeMap::from([(reference, at(path[&reference]))]);
+        let mut poses = BTreeMap::from([(reference, Pose::at(path[&reference]))]);
         let is_one_camera = is_one_camera(self.views);
         if !at_rest.is_empty() {
             let middle = at_rest.iter().map(|time| path[time]).sum::<DVec3>() / at_rest.len() as f64;
-            poses.extend(at_rest.iter().map(|time| (*time, at(middle))));
+            poses.extend(at_rest.iter().map(|time| (*time, Pose::at(middle))));
         } else if self.outline.is_surrounded && is_one_camera {
             let mut near = times.to_vec();
             near.sort_by_key(|time| time.abs_diff(reference));
-            poses.extend(near.iter().take(TOGETHER).map(|time| (*time, at(path[time]))));
+            poses.extend(near.iter().take(TOGETHER).map(|time| (*time, Pose::at(path[time]))));
         }
         let poses = if is_one_camera { self.with_rests(poses, &rests, path) } else { vec![poses] };
         Some(Starts { reference, poses })

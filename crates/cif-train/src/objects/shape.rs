@@ -65,6 +65,24 @@ pub(super) struct Pose {
     pub(super) translation: DVec3,
 }
 
+impl Pose {
+    /// Upright at a place.
+    pub(super) fn at(place: DVec3) -> Self {
+        Self { rotation: DQuat::IDENTITY, translation: place }
+    }
+
+    /// Carries Gaussians whose colours are the same from everywhere.
+    pub(super) fn carry(&self, gaussians: &mut Gaussians) {
+        for (mean, quaternion) in gaussians.means.iter_mut().zip(&mut gaussians.quaternions) {
+            let moved = self.rotation * DVec3::from_array(mean.map(f64::from)) + self.translation;
+            *mean = moved.as_vec3().to_array();
+            let [w, x, y, z] = quaternion.map(f64::from);
+            let turned = self.rotation * DQuat::from_xyzw(x, y, z, w);
+            *quaternion = [turned.w, turned.x, turned.y, turned.z].map(|value| value as f32);
+        }
+    }
+}
+
 /// Gaussians of an object, with their optimiser and a renderer.
 pub(super) struct Shape {
     field: Field,

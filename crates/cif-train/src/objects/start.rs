@@ -152,6 +152,16 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
     }))
 }
 
+impl Fitted {
+    /// Its Gaussians where its reference pose puts them.
+    pub(crate) fn placed(&self) -> Gaussians {
+        let mut placed = self.gaussians.clone();
+        let (rotation, translation) = self.reference;
+        Pose { rotation, translation }.carry(&mut placed);
+        placed
+    }
+}
+
 impl<'a> Object<'a> {
     /// The object in the best way of moving along the path of its outline; `None` where it is at rest, or its masks do not
     /// show enough.
@@ -227,7 +237,7 @@ impl<'a> Object<'a> {
 
     /// Error of the object bending in one place, on the views that it is fitted to.
     fn bent_in_place(&self, views: &[usize]) -> Option<f64> {
-        let at_rest = Pose { rotation: DQuat::IDENTITY, translation: self.resting_place(views)? };
+        let at_rest = Pose::at(self.resting_place(views)?);
         let poses = views.iter().map(|k| (self.views[*k].time_index, at_rest)).collect();
         let shape = self.hull(&poses, FOLLOWED, &mut self.rng())?;
         let mut fit = self.fit(poses, shape, self.rng());

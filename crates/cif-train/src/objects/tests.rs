@@ -648,8 +648,7 @@ fn what_folds_on_its_way_is_explained_by_bending_and_a_solid_is_not() {
     let bent = |fold: f64| {
         let views = views_of_groups(gaussians(), group_of.clone(), &[side(-1.0, fold), side(1.0, fold)], rig);
         with_objects(Some(&FLOOR), &views, |objects| {
-            let poses: BTreeMap<usize, Pose> =
-                (0..TIMES).map(|k| (k, Pose { rotation: DQuat::IDENTITY, translation: at(k) })).collect();
+            let poses: BTreeMap<usize, Pose> = (0..TIMES).map(|k| (k, Pose::at(at(k)))).collect();
             let mut rng = objects[0].rng();
             let shape = objects[0].hull(&poses, 150, &mut rng).unwrap();
             let mut fit = objects[0].fit(poses, shape, rng);

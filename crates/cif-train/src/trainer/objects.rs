@@ -342,14 +342,6 @@ impl Trainer {
     /// which it returns the place.
     fn join(&mut self, instance: &Instance, fitted: &Fitted) -> u32 {
         let (rotation, place) = fitted.reference;
-        let mut rows = fitted.gaussians.clone();
-        for (mean, quaternion) in rows.means.iter_mut().zip(&mut rows.quaternions) {
-            let moved = rotation * DVec3::from_array(mean.map(f64::from)) + place;
-            *mean = moved.to_array().map(|value| value as f32);
-            let [w, x, y, z] = quaternion.map(f64::from);
-            let turned = rotation * glam::DQuat::from_xyzw(x, y, z, w);
-            *quaternion = [turned.w, turned.x, turned.y, turned.z].map(|value| value as f32);
-        }
         let times = &self.state.dataset.times;
         let back = rotation.inverse();
         let mut poses: Vec<TrackPose> = fitted
@@ -369,7 +361,7 @@ impl Trainer {
         let rotation = Some(fitted.rotation);
         let group = TrackGroup { poses, rotation, ..TrackGroup::of_instance(instance, place) };
         let shares: Vec<f64> = fitted.shares.values().copied().collect();
-        self.add_group(rows, group, &shares)
+        self.add_group(fitted.placed(), group, &shares)
     }
 
     /// Adds Gaussians to the field, in a group of their own that skips the network; returns its place. Its poses are
@@ -402,11 +394,7 @@ impl Trainer {
     /// Adds the Gaussians of an object that deforms to the field, which the network moves and nothing holds; returns the row
     /// of the first.
     fn add_deforming(&mut self, found: &Bending) -> usize {
-        let mut rows = found.gaussians.clone();
-        for mean in &mut rows.means {
-            *mean = (DVec3::from_array(mean.map(f64::from)) + found.place).as_vec3().to_array();
-        }
-        let first = self.append(rows);
+        let first = self.append(found.placed());
         self.state.guidance.extend(first, found.gaussians.len(), FREE);
         first
     }

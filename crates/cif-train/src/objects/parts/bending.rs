@@ -5,6 +5,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use super::super::bend::Shifts;
+use super::super::shape::Pose;
 
 /// An object that deforms where it stands.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -21,6 +22,13 @@ pub(crate) struct Bending {
 }
 
 impl Bending {
+    /// Its Gaussians in the world.
+    pub(crate) fn placed(&self) -> Gaussians {
+        let mut placed = self.gaussians.clone();
+        Pose::at(self.place).carry(&mut placed);
+        placed
+    }
+
     /// Gradients, of a weight by metre, that pull displaced places of the object in the world to where they are at a time.
     pub(crate) fn pulled(
         &self,

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use cif_field::Gaussians;
 use cif_field::tracks::JointKind;
-use glam::{DQuat, DVec3};
+use glam::DVec3;
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -200,14 +200,7 @@ impl<'a> Search<'a> {
             let mut gaussians = kept(k + 1);
             let hinge = joint.hinge;
             let start = *joint.values.values().next()?;
-            let (turn, place) = hinge.pose(start);
-            for (mean, quaternion) in gaussians.means.iter_mut().zip(&mut gaussians.quaternions) {
-                let moved = turn * (DVec3::from_array(mean.map(f64::from)) - hinge.point) + place;
-                *mean = moved.as_vec3().to_array();
-                let [w, x, y, z] = quaternion.map(f64::from);
-                let turned = turn * DQuat::from_xyzw(x, y, z, w);
-                *quaternion = [turned.w, turned.x, turned.y, turned.z].map(|value| value as f32);
-            }
+            hinge.posed(&Pose::at(DVec3::ZERO), start).carry(&mut gaussians);
             // It opens towards positive values.
             let values = joint.values.values().map(|value| value - start);
             let most =
@@ -271,14 +264,10 @@ impl Jointed {
 
     /// The same elsewhere.
     pub(super) fn moved(mut self, by: DVec3) -> Self {
-        let shift = |gaussians: &mut Gaussians| {
-            for mean in &mut gaussians.means {
-                *mean = (DVec3::from_array(mean.map(f64::from)) + by).as_vec3().to_array();
-            }
-        };
-        shift(&mut self.base);
+        let shift = Pose::at(by);
+        shift.carry(&mut self.base);
         for part in self.parts_mut() {
-            shift(&mut part.gaussians);
+            shift.carry(&mut part.gaussians);
             part.hinge.point += by;
         }
         self

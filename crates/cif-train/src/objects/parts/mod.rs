@@ -31,7 +31,7 @@ use std::collections::BTreeMap;
 
 use cif_field::Gaussians;
 use cif_field::tracks::JointKind;
-use glam::{DQuat, DVec3};
+use glam::DVec3;
 use rayon::prelude::*;
 
 pub(crate) use self::bending::Bending;
@@ -98,7 +98,7 @@ pub(super) fn turning_ball(object: Object<'_>) -> Result<Option<Jointed>, TrainE
     phases.check()?;
     let Some((Turning { axis, angles }, errors)) = turning(shown(), &ball) else { return Ok(None) };
     phases.check()?;
-    let at_rest = Pose { rotation: DQuat::IDENTITY, translation: ball.centre };
+    let at_rest = Pose::at(ball.centre);
     let base: BTreeMap<usize, Pose> = object.views.iter().map(|view| (view.time_index, at_rest)).collect();
     let is_shown = |view: &usize| !object.views[*view].is_sliver();
     let views = (0..object.views.len()).filter(is_shown).collect();
@@ -142,7 +142,7 @@ pub(super) fn find(object: Object<'_>) -> Result<Option<InPlace>, TrainError> {
     let views = object.views;
     let rays = views.iter().map(|view| (view, view.visible.powi(2)));
     let Some(place) = meeting_point(rays) else { return Ok(None) };
-    let at_rest = Pose { rotation: DQuat::IDENTITY, translation: place };
+    let at_rest = Pose::at(place);
     let base: BTreeMap<usize, Pose> = views.iter().map(|view| (view.time_index, at_rest)).collect();
     Ok(find_on(object, &base)?.map(|found| match found {
         InPlace::Jointed(found) => InPlace::Jointed(found.moved(place)),
