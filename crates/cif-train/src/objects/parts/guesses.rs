@@ -36,7 +36,7 @@ pub(super) struct Sides {
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Guess {
     pub(super) hinge: Hinge,
-    /// What is of the part.
+    /// Region of the part.
     pub(super) cut: Cut,
     /// Values that are tried at each time.
     pub(super) values: JointValues,
@@ -45,13 +45,13 @@ pub(super) struct Guess {
 /// A side of a plane: its normal, and its offset.
 pub(super) type Side = (DVec3, f64);
 
-/// What of an object is of a part.
+/// Region of an object that is a part.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Cut {
-    /// What is beyond a plane.
+    /// Beyond a plane.
     Beyond(Side),
-    /// What is beyond both of two planes or of neither; all else is a second part, which turns the other way, as the blades
-    /// of scissors.
+    /// Beyond both of two planes or of neither; all else is a second part, which turns the other way, as the blades of
+    /// scissors.
     Crossed([Side; 2]),
 }
 
@@ -95,7 +95,7 @@ impl Cut {
         }
     }
 
-    /// What the second part has; `None` where there is none.
+    /// Region of the second part; `None` where there is none.
     pub(super) fn other(&self) -> Option<Self> {
         match self {
             Self::Beyond(_) => None,
