@@ -257,16 +257,11 @@ impl Jointed {
         std::iter::once(&self.part).chain(self.second.as_deref())
     }
 
-    /// The same to be changed.
-    pub(crate) fn parts_mut(&mut self) -> impl Iterator<Item = &mut JointedPart> {
-        std::iter::once(&mut self.part).chain(self.second.as_deref_mut())
-    }
-
     /// The same elsewhere.
     pub(super) fn moved(mut self, by: DVec3) -> Self {
         let shift = Pose::at(by);
         shift.carry(&mut self.base);
-        for part in self.parts_mut() {
+        for part in std::iter::once(&mut self.part).chain(self.second.as_deref_mut()) {
             shift.carry(&mut part.gaussians);
             part.hinge.point += by;
         }

@@ -3,9 +3,9 @@
 //! An object is first made of Gaussians that do not move in its frame: as it looks at all times, and as it looks at the
 //! times in a row that are most alike, say while its lid is closed. Where the first leave residuals that the second do
 //! not, joints are guessed by the box around the second, and the values of each are searched for at some times with
-//! these Gaussians cut in two, of scissors as two parts that turn against each other. The best of the joints get Gaussians for base and part, and are moved together with values
-//! and axis against the pictures. What wins must explain pixels that were left out better than the static Gaussians do, and
-//! about as well as Gaussians that bend, or the object deforms.
+//! these Gaussians cut in two, those of scissors into parts that turn against each other. The best of the joints get Gaussians
+//! for base and part, and are moved together with values and axis against the pictures. What wins must explain pixels that
+//! were left out better than the static Gaussians do, and about as well as Gaussians that bend, or the object deforms.
 //!
 //! | file | answers |
 //! |---|---|
@@ -217,13 +217,11 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<In
         fit.loss <= SIMPLE * best && slides && fit.body.reach() <= search.size
     };
     let taken = fine.iter().position(is_simple).unwrap_or(0);
-    let found = fine.swap_remove(taken);
-    if found.loss > GAIN * still {
+    let Fit { body, loss: error, .. } = fine.swap_remove(taken);
+    if error > GAIN * still {
         return Ok(None);
     }
-    if let Some(bending) = search.bending().filter(|bending| bending.error < DEFORMS * found.loss) {
-        return Ok(Some(InPlace::Bends(bending)));
-    }
-    let Fit { body, loss: error, .. } = found;
-    Ok(search.finished(body, [error, still]).map(InPlace::Jointed))
+    let bending = search.bending().filter(|bending| bending.error < DEFORMS * error);
+    let jointed = || search.finished(body, [error, still]).map(InPlace::Jointed);
+    Ok(bending.map(InPlace::Bends).or_else(jointed))
 }

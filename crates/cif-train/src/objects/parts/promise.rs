@@ -52,8 +52,10 @@ impl<'a> Search<'a> {
         let sides = Sides::around(&inside, self.up.unwrap_or(DVec3::Z));
         let stands = self.object.surroundings.plane;
         let mut tried = self.tried_of(closed, guesses(&sides, stands));
+        let as_it_is = JointValues::open(vec![0.0]);
+        let (_, uncut) = search(closed, &self.times(LOOKS), &as_it_is, self.level());
         let best = tried.iter().map(|tried| tried.loss).fold(f64::INFINITY, f64::min);
-        if best > PROMISE * self.uncut(closed) {
+        if best > PROMISE * uncut {
             return Vec::new();
         }
         if self.one_camera {
@@ -63,28 +65,8 @@ impl<'a> Search<'a> {
                 tried.extend(self.tried_of(closed, guesses(&turned, stands)));
             }
         }
-        self.distinct(tried)
-    }
-
-    /// Guesses about a body with their values.
-    fn tried_of(&self, body: &Body<'a>, guesses: Vec<Guess>) -> Vec<TriedGuess> {
-        let (times, level) = (self.times(LOOKS), self.level());
-        let try_one = |guess: Guess| {
-            let body = self.cut(body, &guess)?;
-            let (values, loss) = search(&body, &times, &guess.values, level);
-            Some(TriedGuess { guess, values, loss })
-        };
-        guesses.into_par_iter().filter_map(try_one).collect()
-    }
-
-    /// Mean loss per view of a body as it is.
-    fn uncut(&self, body: &Body<'a>) -> f64 {
-        search(body, &self.times(LOOKS), &JointValues::open(vec![0.0]), self.level()).1
-    }
-
-    /// Of guesses about one axis the best, best first.
-    fn distinct(&self, mut tried: Vec<TriedGuess>) -> Vec<TriedGuess> {
         tried.sort_by(|a, b| a.loss.total_cmp(&b.loss));
+        // Of joints about one axis the best.
         let mut distinct: Vec<TriedGuess> = Vec::new();
         for found in tried {
             let Guess { hinge, cut, .. } = found.guess;
@@ -97,6 +79,17 @@ impl<'a> Search<'a> {
             }
         }
         distinct
+    }
+
+    /// Guesses about a body with their values.
+    fn tried_of(&self, body: &Body<'a>, guesses: Vec<Guess>) -> Vec<TriedGuess> {
+        let (times, level) = (self.times(LOOKS), self.level());
+        let try_one = |guess: Guess| {
+            let body = self.cut(body, &guess)?;
+            let (values, loss) = search(&body, &times, &guess.values, level);
+            Some(TriedGuess { guess, values, loss })
+        };
+        guesses.into_par_iter().filter_map(try_one).collect()
     }
 
     /// A static body with what a guess cuts of it as a part at the value 0, or two; `None` where that is too little or too
