@@ -19,6 +19,7 @@
 //! | [`adam`] | the optimiser, and the regularisers of the planes |
 //! | [`density`] | which Gaussians come and go: densification strategies, relocation to instances with volume conservation |
 //! | [`effects`] | what has to show while it trains that it is worth its cost, one file each |
+//! | `background` | which colour shows where no Gaussian is |
 //! | [`estimate`] | whose each Gaussian is, from masks |
 //! | `engine` | what computes the steps of a run: the processor, or a GPU |
 //! | `objects` | how rigid objects get poses, before the scene is trained |
@@ -50,6 +51,7 @@
 extern crate self as cif_train;
 
 pub mod adam;
+mod background;
 pub mod budget;
 pub mod clock;
 pub mod config;

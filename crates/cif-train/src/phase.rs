@@ -88,7 +88,7 @@ impl Phase {
             Self::Open => "opening the capture",
             Self::Points => "triangulating points by the poses of the capture",
             Self::Plan => "looking at the capture",
-            Self::Calibrate => "measuring steps for the budget",
+            Self::Calibrate => "measuring steps",
             Self::Decode => "decoding training frames",
             Self::Masks => "checking masks",
             Self::Probe => "trying steps on the processor and the GPU",

@@ -10,6 +10,7 @@ use cif_field::tracks::NO_GROUP;
 use cif_geometry::PixelGrid;
 use cif_render::{Blending, Gradients, InstanceSettings, RenderSettings, RenderedImage, UNLABELLED};
 
+use crate::background::Background;
 use crate::config::{ObjectMotion, TrainConfig};
 use crate::density::DensifyStatistics;
 use crate::error::TrainError;
@@ -31,6 +32,8 @@ pub(crate) struct State {
     /// The capture as it is, where that is another size.
     pub whole: Option<Whole>,
     pub config: TrainConfig,
+    /// What shows where no Gaussian is.
+    pub background: Background,
     /// Gaussians nearer to the camera than this are not drawn.
     pub near: f32,
     pub frames: FrameStore,
@@ -103,7 +106,7 @@ impl State {
     pub(crate) fn color_settings(&self) -> RenderSettings {
         RenderSettings {
             sh_degree: self.field.sh_degree,
-            background: self.config.background,
+            background: self.background.shown,
             near: self.near,
             antialiased: self.config.antialiased,
             sort_metric: self.config.sort_metric,

@@ -676,6 +676,14 @@ fn a_plan_looks_for_points_as_training_does() {
     let expected = |key: &str| report["expected"][key].as_f64().unwrap();
     assert!(expected("steps_s") > 0.0 && expected("memory_bytes") > 1e7, "{report}");
     assert!(expected("measured_steps") >= 3.0 && report["threads"].as_u64() >= Some(1), "{report}");
+    // A run says the same before its first step; a short one, and one that is quiet, say nothing.
+    let long = "train table -o run.cif --force --preset draft --set motion.rigid=false --stop-after 1";
+    for (line, says) in
+        [("", true), (" -q", false), (" --iterations-fine 300 --iterations-instance 100", false)]
+    {
+        let trained = cif(path, &format!("{long}{line}")).succeeds();
+        assert_eq!(trained.stderr.contains("expected: "), says, "{line}: {}", trained.stderr);
+    }
     fs::remove_file(path.join("table/points.npy")).unwrap();
     let plan = cif(path, "plan table").succeeds();
     assert!(plan.stderr.contains("it has no points"), "{}", plan.stderr);

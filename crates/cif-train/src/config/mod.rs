@@ -31,8 +31,12 @@ pub struct TrainConfig {
     /// capture is opened.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub downscale: Option<u32>,
-    /// Colour behind everything, display-referred RGB in [0, 1], default white.
-    pub background: [f32; 3],
+    /// Colour behind everything, display-referred RGB in [0, 1]. Default none: white where images have transparent
+    /// pixels, and the colour of a backdrop where a quarter of the pixels at their borders has exactly one; else another
+    /// colour in every step, so that nothing shows through, and scenes show the mean colour at these borders. White in
+    /// `paper`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub background: Option<[f32; 3]>,
     /// Gaussians nearer to the camera than this are not drawn, units of the capture. Default 0: as near as its points
     /// say that the scene comes; 0.2 in `paper`.
     pub near: f32,
@@ -452,6 +456,12 @@ impl DensifyConfig {
 }
 
 impl TrainConfig {
+    /// Colour that transparent pixels of images are laid over, display-referred RGB in [0, 1].
+    #[must_use]
+    pub fn laid_over(&self) -> [f32; 3] {
+        self.background.unwrap_or([1.0; 3])
+    }
+
     /// Steps of the fine stage.
     #[must_use]
     pub fn fine_iterations(&self) -> u32 {

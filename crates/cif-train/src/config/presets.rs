@@ -68,6 +68,7 @@ fn best() -> TrainConfig {
 
 fn paper(layout: Layout) -> TrainConfig {
     let mut config = TrainConfig { preset: Preset::Paper, ..TrainConfig::default() };
+    config.background = Some([1.0; 3]);
     config.near = 0.2;
     config.stages = StagesConfig {
         coarse: 3_000,
@@ -185,7 +186,7 @@ impl Default for TrainConfig {
             preset: Preset::Standard,
             seed: 0,
             downscale: None,
-            background: [1.0; 3],
+            background: None,
             near: 0.0,
             antialiased: false,
             sort_metric: SortMetric::Z,

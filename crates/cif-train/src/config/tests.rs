@@ -64,7 +64,7 @@ fn impossible_settings_are_refused_by_key() {
         ("stages.batch", |c| c.stages.batch = 0),
         ("stages.batch", |c| c.stages.batch = u32::MAX),
         ("near", |c| c.near = f32::NAN),
-        ("background[1]", |c| c.background[1] = 1.5),
+        ("background[1]", |c| c.background = Some([0.0, 1.5, 0.0])),
         ("model.multipliers", |c| c.model.multipliers.clear()),
         ("model.time_resolution", |c| c.model.time_resolution = 1),
         ("rates.means", |c| c.rates.means = [1e-4, 0.0]),

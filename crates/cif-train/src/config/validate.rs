@@ -42,7 +42,7 @@ impl TrainConfig {
     /// What is trained on, and for how long.
     fn validate_run(&self) -> Result<(), ConfigError> {
         let stages = &self.stages;
-        for (channel, value) in self.background.iter().enumerate() {
+        for (channel, value) in self.background.iter().flatten().enumerate() {
             let key = ["background[0]", "background[1]", "background[2]"][channel];
             within(key, *value, 0.0..=1.0, "expected a number in [0, 1]")?;
         }

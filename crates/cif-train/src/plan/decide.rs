@@ -342,15 +342,16 @@ impl Plan<'_> {
     }
 
     fn background(&self) -> Effect {
-        let [red, green, blue] = self.config.background;
+        let given = |[red, green, blue]: [f32; 3]| format!("{red} {green} {blue}");
         Effect {
             effect: EffectKind::Background,
-            decision: Decision::Value(format!("{red} {green} {blue}")),
-            evidence: if self.found.has_alpha {
-                "images have alpha and are laid over it".to_owned()
-            } else {
-                "images are opaque: it shows only where no Gaussian is".to_owned()
-            },
+            decision: Decision::Value(self.config.background.map_or("automatic".to_owned(), given)),
+            evidence: match self.config.background {
+                _ if self.found.has_alpha => "images have alpha: what is transparent shows it",
+                None => "images are opaque: the mean colour at their borders, or that of a backdrop",
+                Some(_) => "images are opaque: it shows only where no Gaussian is",
+            }
+            .to_owned(),
             cost: "none".to_owned(),
             flag: "--set background=[R,G,B]".to_owned(),
         }

@@ -13,6 +13,7 @@ use super::measured_frames::MeasuredFrames;
 use super::saved::inputs_of;
 use super::saving::Saving;
 use super::{Trainer, initialize, near};
+use crate::background::Background;
 use crate::config::{DensifyConfig, HeadName, MotionConfig, TrainConfig};
 use crate::density::{self, DensifyStatistics};
 use crate::detail;
@@ -194,7 +195,7 @@ impl Trainer {
             HeadName::LangSplat => cif_dataset::feature_maps(&dataset, Path::new(&config.head.maps))?,
             _ => BTreeMap::new(),
         };
-        let mut frames = FrameStore::open(&dataset, config.background, maps, budget, &phases)?;
+        let mut frames = FrameStore::open(&dataset, config.laid_over(), maps, budget, &phases)?;
         let has_instances =
             config.effects.instances && !dataset.instances.is_empty() && frames.has_labels(&dataset);
         let mut messages = Vec::new();
@@ -202,12 +203,14 @@ impl Trainer {
             messages.extend(put_masks_right(&mut frames, &dataset, &config.motion, &phases)?);
         }
         messages.extend(allow_detail(&mut config.densify, &dataset, &frames)?);
+        let background = Background::of(&dataset, &frames, &config)?;
+        field.background = background.shown;
         let near = match config.near {
             0.0 => field.record.drawing.near.unwrap_or_else(|| near::automatic(&dataset)),
             near => near,
         };
         let training = (0..frames.len()).map(|k| frames.index(k)).collect();
-        let whole = capture.map(|capture| Whole::of(capture, training, config.background));
+        let whole = capture.map(|capture| Whole::of(capture, training, config.laid_over()));
         let n = field.gaussians.len();
         let simd = SimdLevel::Auto;
         Ok(Self {
@@ -247,6 +250,7 @@ impl Trainer {
                 dataset,
                 whole,
                 config,
+                background,
                 near,
                 frames,
                 phases,

@@ -44,7 +44,7 @@ impl Trainer {
             .map(|k| {
                 self.check_stop()?;
                 let index = held_out[k * held_out.len() / count];
-                Ok((index, self.state.capture().load_frame(index, self.state.config.background)?))
+                Ok((index, self.state.capture().load_frame(index, self.state.field.background)?))
             })
             .collect::<Result<Vec<_>, TrainError>>()?;
         let scores = self.score(&frames)?;
@@ -85,7 +85,7 @@ impl Trainer {
                 self.state.progress.curve.frame_names = indices.iter().map(name).collect();
                 let load = |index| {
                     self.check_stop()?;
-                    Ok((index, self.state.capture().load_frame(index, self.state.config.background)?))
+                    Ok((index, self.state.capture().load_frame(index, self.state.field.background)?))
                 };
                 indices.into_iter().map(load).collect::<Result<_, TrainError>>()?
             }

@@ -86,7 +86,7 @@ impl Trainer {
             field.replace_instances(initialize::instances(&dataset));
         }
         field.gaussians.occupancy_logits.fill(logit(config.instance.occupancy));
-        (field.background, field.sort_metric) = (config.background, config.sort_metric);
+        field.sort_metric = config.sort_metric;
         let mut trainer = Self::assemble(
             Start { dataset, phases: phases.clone() },
             measured_frames,

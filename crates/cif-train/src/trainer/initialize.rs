@@ -58,7 +58,7 @@ pub(super) fn initial_field(dataset: &Dataset, config: &TrainConfig) -> Result<F
         },
         cameras: dataset.frames.iter().map(camera).collect(),
         sh_degree: 0,
-        background: config.background,
+        background: config.laid_over(),
         sort_metric: config.sort_metric,
         extent: dataset.extent() as f32,
         record: Default::default(),

@@ -228,7 +228,7 @@ fn exposures_are_learnt_where_cameras_disagree() {
     let folder = tempfile::tempdir().unwrap();
     let scene = Scene { times: 2, disagree: true, ..Scene::default() };
     let dataset = with_known_points(capture(folder.path(), scene));
-    let dark = TrainConfig { background: [0.0; 3], ..small_config() };
+    let dark = TrainConfig { background: Some([0.0; 3]), ..small_config() };
     let config = planned(&dataset, &dark, "auto");
     assert!(config.effects.exposure);
     let (with, without) = (
@@ -270,7 +270,7 @@ fn a_camera_that_adapts_while_it_films_is_recognised_from_what_it_sees() {
     // What other cameras are elsewhere is one camera here.
     let of_training = |frame: &&mut Frame| frame.split == Split::Train;
     dataset.frames.iter_mut().filter(of_training).for_each(|frame| frame.camera_name = "phone".into());
-    let dark = TrainConfig { background: [0.0; 3], ..small_config() };
+    let dark = TrainConfig { background: Some([0.0; 3]), ..small_config() };
     let config = planned(&dataset, &dark, "auto");
     assert!(config.effects.exposure_in_time && !config.effects.exposure);
     let (with, without) = (

@@ -157,7 +157,7 @@ fn exposures_of_cameras_that_disagree_are_found_as_on_the_processor() {
     let folder = tempfile::tempdir().unwrap();
     let scene = Scene { times: 1, disagree: true, masks: false, ..Scene::default() };
     let dataset = with_known_points(capture(folder.path(), scene));
-    let mut config = TrainConfig { background: [0.0; 3], ..small_config() };
+    let mut config = TrainConfig { background: Some([0.0; 3]), ..small_config() };
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (150, 250, 0);
     config.effects.exposure = true;
     // A fixed set of Gaussians, so that the runs stay close.
@@ -190,7 +190,7 @@ fn exposures_of_images_are_found_as_on_the_processor() {
         Scene { times: 4, views: 4, one_camera: true, disagree: true, masks: false, ..Scene::default() };
     let mut dataset = with_known_points(capture(folder.path(), scene));
     dataset.frames.iter_mut().for_each(|frame| frame.camera_name = "phone".into());
-    let mut config = TrainConfig { background: [0.0; 3], ..small_config() };
+    let mut config = TrainConfig { background: Some([0.0; 3]), ..small_config() };
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (60, 60, 0);
     config.effects.exposure_in_time = true;
     config.densify.until = 0;

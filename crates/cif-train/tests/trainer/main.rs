@@ -7,6 +7,7 @@
 //! | `acceptance` | identities and their resampling keep what they promise |
 //! | `from_scene` | instances on the reconstruction of another run |
 //! | `density`, `added_effects` | densification rules, and an effect, declared by a test |
+//! | `background` | what shows where no Gaussian is |
 //! | `heads` | a head declared by a test, on every engine |
 //! | `memory` | frames that do not fit into memory, read ahead |
 //! | `curve`, `pacing`, `measure` | error curves, budgets of time, measured steps |
@@ -16,6 +17,7 @@
 
 mod acceptance;
 mod added_effects;
+mod background;
 mod compared_heads;
 mod curve;
 mod density;

@@ -3,18 +3,15 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use cif_dataset::Dataset;
-use cif_train::budget::BudgetClock;
-use cif_train::config::DensifyRule;
-use cif_train::fit::{Expected, Workload, calibrate};
+use cif_train::fit::Expected;
 use cif_train::{Clock, EffectChoice, EffectPlan, Stop, SystemClock, TrainConfig};
 use clap::Args;
 use serde::Serialize;
 
+use crate::commands::shared::expected::{expected, in_words};
 use crate::commands::shared::named::preset;
 use crate::commands::shared::{CaptureOptions, print_warnings};
 use crate::error::Error;
-use crate::progress::duration;
 use crate::report::{JsonReport, OnlyReport};
 use crate::{interrupt, starting_points};
 
@@ -69,31 +66,22 @@ pub(super) fn run(command: &Plan) -> Result<(), Error> {
     command.report.check([command.capture.as_path()])?;
     let preset = preset(&command.preset, "--preset")?;
     let mut dataset = command.capture_options.open(&command.capture)?;
-    let config = TrainConfig::preset(preset, dataset.layout);
+    let mut config = TrainConfig::preset(preset, dataset.layout);
     // As in training: what points show of the light of cameras is evidence.
     if config.model.triangulate {
         starting_points::find(&mut dataset, &Stop::when(interrupt::requested).into())?;
     }
     print_warnings(&dataset);
     let plan = EffectPlan::new(&dataset, &config, &command.effects).map_err(Error::plain)?;
-    let is_bound = config.densify.rule == DensifyRule::Gradient;
-    let expected = expected(&dataset, config, &plan)?;
-    let report = || PlanReport { plan: plan.clone(), expected, threads: rayon::current_num_threads() };
-    command.report.give(report, || print(&plan, &expected, is_bound))
-}
-
-/// Time and memory of a run on this machine, by steps that are measured.
-fn expected(dataset: &Dataset, mut config: TrainConfig, plan: &EffectPlan) -> Result<Expected, Error> {
     plan.apply(&mut config);
     let clock: Arc<dyn Clock> = Arc::new(SystemClock::start());
-    let threads = rayon::current_num_threads();
-    let calibration =
-        calibrate(dataset, &config, &clock, BudgetClock::Wall, threads, MEASURING_S).map_err(Error::plain)?;
-    let work = Workload::of(dataset, plan.travelling.len());
-    Expected::of(dataset, &config, &calibration, work).map_err(Error::plain)
+    let expected =
+        expected(&dataset, &config, plan.travelling.len(), &clock, MEASURING_S).map_err(Error::plain)?;
+    let report = || PlanReport { plan: plan.clone(), expected, threads: rayon::current_num_threads() };
+    command.report.give(report, || print(&plan, &expected, &config))
 }
 
-fn print(plan: &EffectPlan, expected: &Expected, is_bound: bool) {
+fn print(plan: &EffectPlan, expected: &Expected, config: &TrainConfig) {
     let mut table = crate::commands::shared::table(["effect", "decision", "evidence", "cost", "otherwise"]);
     for effect in &plan.effects {
         table.add_row([
@@ -105,21 +93,5 @@ fn print(plan: &EffectPlan, expected: &Expected, is_bound: bool) {
         ]);
     }
     println!("{table}");
-    let fits = match plan.travelling.len() {
-        _ if expected.fits_s <= 0.0 => String::new(),
-        1 => format!(", {} of it fits of 1 object", duration(expected.fits_s)),
-        objects => format!(", {} of it fits of {objects} objects", duration(expected.fits_s)),
-    };
-    let threads = match rayon::current_num_threads() {
-        1 => "1 thread".to_owned(),
-        threads => format!("{threads} threads"),
-    };
-    println!(
-        "expected: {}{}{fits}, on {threads} of this machine ({} steps measured); up to {} Gaussians; {:.1} GB of memory",
-        if is_bound { "at most " } else { "" },
-        duration(expected.steps_s + expected.fits_s),
-        expected.measured_steps,
-        expected.gaussians,
-        expected.memory_bytes as f64 / 1e9
-    );
+    println!("{}", in_words(expected, config, plan.travelling.len()));
 }

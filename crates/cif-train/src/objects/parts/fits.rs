@@ -29,8 +29,9 @@ pub(super) struct Budget {
 /// Budget of fine fits.
 pub(super) const FINELY: Budget = Budget { base: 500, part: 250, steps: 500 };
 
-/// Places of a hinge that are tried about that of a fit: steps to each side of it, and a step, of the size.
-const PLACES: i32 = 3;
+/// Places of a hinge that are tried about that of a fit: steps to each side of it, then of the best one, and a step, of the
+/// size.
+const PLACES: [f64; 2] = [2.0, 1.0];
 const PLACE: f64 = 0.13;
 
 /// Opacity, as a logit, that the base starts with where the part is.
@@ -131,13 +132,19 @@ impl<'a> Search<'a> {
         let times = self.times(LOOKS);
         let (first, second) = hinge.axis.any_orthonormal_pair();
         let mut best = (hinge, BTreeMap::new(), f64::INFINITY);
-        for (i, j) in (-PLACES..=PLACES).flat_map(|i| (-PLACES..=PLACES).map(move |j| (i, j))) {
-            let aside = PLACE * self.size * (f64::from(i) * first + f64::from(j) * second);
-            let moved = Hinge { point: hinge.point + aside, ..hinge };
-            body.joints.iter_mut().for_each(|joint| joint.hinge = moved);
-            let (values, loss) = search(&body, &times, &guess.values, level);
-            if loss < best.2 {
-                best = (moved, values, loss);
+        for step in PLACES {
+            let around = best.0.point;
+            let steps = [-step, 0.0, step].map(|steps| PLACE * self.size * steps);
+            for aside in steps.iter().flat_map(|i| steps.map(|j| *i * first + j * second)) {
+                let moved = Hinge { point: around + aside, ..hinge };
+                if best.2.is_finite() && moved == best.0 {
+                    continue;
+                }
+                body.joints.iter_mut().for_each(|joint| joint.hinge = moved);
+                let (values, loss) = search(&body, &times, &guess.values, level);
+                if loss < best.2 {
+                    best = (moved, values, loss);
+                }
             }
         }
         let (placed, values, _) = best;

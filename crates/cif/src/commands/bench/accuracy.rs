@@ -220,7 +220,7 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
         Some(only) => rungs.file(&format!("{only}.json")),
         None => command.output.join("report.json"),
     })?;
-    measure::save_truth(&dataset, config.background, &rungs.file("truth.png"))?;
+    measure::save_truth(&dataset, config.laid_over(), &rungs.file("truth.png"))?;
     let mut inputs = MadeFrom::new();
     inputs.value("version", env!("CARGO_PKG_VERSION")).capture(&dataset, rungs.known(BASE).as_ref());
     let mut bench = Bench {

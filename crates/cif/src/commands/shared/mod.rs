@@ -5,6 +5,7 @@
 //! | [`asked`] | what a detector's masks show of a scene |
 //! | [`capture`] | which capture is read, and how |
 //! | [`command_line`] | how a command is pasted into a shell |
+//! | [`expected`] | what a run is expected to take |
 //! | [`model_options`] | how motion models are chosen on the command line |
 //! | [`motion`] | how well the motion of a scene is that of known points |
 //! | [`motion_table`] | what motion reports show in tables |
@@ -20,6 +21,7 @@
 pub(in crate::commands) mod asked;
 pub(in crate::commands) mod capture;
 pub(in crate::commands) mod command_line;
+pub(in crate::commands) mod expected;
 pub(in crate::commands) mod model_options;
 pub(in crate::commands) mod motion;
 pub(in crate::commands) mod motion_table;

@@ -66,7 +66,7 @@ fn percent(text: &str) -> Result<f64, String> {
 
 /// The time of one command.
 pub(super) struct Timing {
-    clock: Arc<dyn Clock>,
+    pub(super) clock: Arc<dyn Clock>,
     start: Seconds,
     budget: Option<Budget>,
 }

@@ -17,6 +17,7 @@ use cif_train::{
 };
 use clap::{Args, ValueEnum};
 
+use super::shared::expected::{expected, in_words};
 use super::shared::named::{HeadArgument, preset};
 use super::shared::simd::Simd;
 use crate::commands::shared::{CaptureOptions, command_line, print_warnings};
@@ -28,6 +29,10 @@ use crate::settings::Layers;
 use crate::{endings, interrupt, starting_points, training};
 use budget::{Goals, Timing};
 use watch::{Opening, Watch};
+
+/// Most seconds of measuring steps, once three are done, and the steps of a run from which they are.
+const MEASURING_S: f64 = 0.5;
+const LONG: u32 = 1_000;
 
 /// Train a scene on a capture
 #[derive(Debug, Args)]
@@ -341,6 +346,18 @@ fn open_capture(
     Ok((dataset, has_points))
 }
 
+/// True where it is said before the first step how long a run takes: not of a few steps, nor of one that a budget ends, and
+/// steps of a GPU take another time than those that are measured here.
+fn expects_time(command: &Train, config: &TrainConfig) -> bool {
+    #[cfg(feature = "wgpu")]
+    let is_measured = command.backend == super::backend::Backend::Cpu;
+    #[cfg(not(feature = "wgpu"))]
+    let is_measured = true;
+    let stages = &config.stages;
+    let steps = config.fine_iterations() + stages.coarse + stages.instance;
+    is_measured && !command.quiet && !command.goals.changes_steps() && steps >= LONG
+}
+
 /// A trainer at its first step; `has_points` is false where points were needed and could not be triangulated.
 fn begin(
     command: &Train,
@@ -360,6 +377,13 @@ fn begin(
         let preset = TrainConfig::preset(config.preset, dataset.layout);
         let (goals, options) = (&command.goals, &command.capture_options);
         dataset = goals.fit(timing, &mut config, &preset, dataset, options, &phases, command.quiet)?;
+    }
+    if let Some(plan) = plan.as_ref().filter(|_| expects_time(command, &config)) {
+        let phase = phases.enter(Phase::Calibrate, 0);
+        let objects = plan.travelling.len();
+        let expected = expected(&dataset, &config, objects, &timing.clock, MEASURING_S);
+        drop(phase);
+        eprintln!("{}", in_words(&expected.map_err(|error| not_started(command, error))?, &config, objects));
     }
     destination.check_settings(&config)?;
     let start = Start { dataset, phases };

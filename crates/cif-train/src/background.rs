@@ -1,0 +1,97 @@
+//! The colour behind everything, which shows where no Gaussian is.
+//!
+//! A constant one shows through: what has its colour needs no Gaussians, and leaves as a hole. So where the images of a
+//! capture are full of scene, every step has a background of its own, and only what is opaque explains them. Scenes show
+//! what lies beyond the images then in the mean colour at their borders: of all colours the one that is least far from what
+//! would be there, in the mean squared error.
+
+use std::collections::HashMap;
+
+use cif_dataset::Dataset;
+use cif_geometry::PixelGrid;
+use rand::RngExt;
+
+use crate::config::TrainConfig;
+use crate::error::TrainError;
+use crate::frames::FrameStore;
+use crate::random::{Purpose, stream};
+
+/// Training images that are looked at.
+const IMAGES: usize = 16;
+
+/// Width of the border of an image, of its shorter side.
+const BORDER: f64 = 0.05;
+
+/// Share of the pixels at the borders that have exactly one colour from which it is a backdrop: one of four sides. No
+/// camera records one value so often, unless it is the largest or the least.
+const BACKDROP: f64 = 0.25;
+
+/// The background of a run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Background {
+    /// Colour that scenes show, display-referred RGB in [0, 1].
+    pub(crate) shown: [f32; 3],
+    /// True where every step has one of its own.
+    varies: bool,
+}
+
+impl Background {
+    /// The background that settings ask for, or that the training images of a capture imply.
+    ///
+    /// # Errors
+    /// When an image cannot be read.
+    pub(crate) fn of(
+        dataset: &Dataset,
+        frames: &FrameStore,
+        config: &TrainConfig,
+    ) -> Result<Self, TrainError> {
+        let constant = |shown: [f32; 3]| Self { shown, varies: false };
+        if let Some(given) = config.background {
+            return Ok(constant(given));
+        }
+        let count = frames.len().min(IMAGES);
+        let (mut sum, mut pixels) = ([0.0_f64; 3], 0_usize);
+        let mut counts: HashMap<[u8; 3], usize> = HashMap::new();
+        for k in (0..count).map(|k| k * frames.len() / count) {
+            let frame = frames.get(dataset, k)?;
+            if dataset.has_alpha {
+                let over_black = dataset.load_image(frames.index(k), [0.0; 3])?;
+                if over_black.pixels != frame.image.pixels {
+                    return Ok(constant(config.laid_over()));
+                }
+            }
+            for color in border(&frame.image) {
+                (0..3).for_each(|channel| sum[channel] += f64::from(color[channel]));
+                *counts.entry(color).or_default() += 1;
+                pixels += 1;
+            }
+        }
+        // Of equals the least: the order of a table of counts is random.
+        let most = counts.into_iter().max_by_key(|(color, count)| (*count, std::cmp::Reverse(*color)));
+        Ok(match most {
+            Some((color, count)) if count as f64 >= BACKDROP * pixels as f64 => {
+                constant(color.map(|value| f32::from(value) / 255.0))
+            }
+            _ => Self { shown: sum.map(|sum| (sum / (255.0 * pixels.max(1) as f64)) as f32), varies: true },
+        })
+    }
+
+    /// The background of a step, counted over all stages.
+    pub(crate) fn of_step(&self, seed: u64, step: u64) -> [f32; 3] {
+        if !self.varies {
+            return self.shown;
+        }
+        let mut rng = stream(seed, Purpose::Backgrounds, step);
+        std::array::from_fn(|_| rng.random())
+    }
+}
+
+/// Pixels at the border of an image.
+fn border(image: &PixelGrid<[u8; 3]>) -> impl Iterator<Item = [u8; 3]> {
+    let (width, height) = (image.width, image.height);
+    let wide = ((BORDER * f64::from(width.min(height))).round() as u32).max(1);
+    let is_within = move |at: u32, size: u32| at >= wide && at + wide < size;
+    let places = (0..height).flat_map(move |y| (0..width).map(move |x| [x, y]));
+    let outer = places.filter(move |[x, y]| !(is_within(*x, width) && is_within(*y, height)));
+    outer.map(|[x, y]| *image.at(x, y))
+}
