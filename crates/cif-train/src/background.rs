@@ -1,20 +1,18 @@
 //! The colour behind everything, which shows where no Gaussian is.
 //!
-//! A constant one shows through: what has its colour needs no Gaussians, and leaves as a hole. So where the images of a
-//! capture are full of scene, every step has a background of its own, and only what is opaque explains them. Scenes show
-//! what lies beyond the images then in the mean colour at their borders: of all colours the one that is least far from what
-//! would be there, in the mean squared error.
+//! What has its colour needs no Gaussians, and leaves as a hole. So where the images of a capture are full of scene, steps
+//! have the colour that is farthest from them, and only what is opaque explains them. Scenes show what lies beyond the
+//! images then in the mean colour at their borders: of all colours the one that is least far from what would be there, in
+//! the mean squared error.
 
 use std::collections::HashMap;
 
 use cif_dataset::Dataset;
 use cif_geometry::PixelGrid;
-use rand::RngExt;
 
 use crate::config::TrainConfig;
 use crate::error::TrainError;
 use crate::frames::FrameStore;
-use crate::random::{Purpose, stream};
 
 /// Training images that are looked at.
 const IMAGES: usize = 16;
@@ -31,8 +29,8 @@ const BACKDROP: f64 = 0.25;
 pub(crate) struct Background {
     /// Colour that scenes show, display-referred RGB in [0, 1].
     pub(crate) shown: [f32; 3],
-    /// True where every step has one of its own.
-    varies: bool,
+    /// Colour that steps have.
+    pub(crate) of_steps: [f32; 3],
 }
 
 impl Background {
@@ -45,7 +43,7 @@ impl Background {
         frames: &FrameStore,
         config: &TrainConfig,
     ) -> Result<Self, TrainError> {
-        let constant = |shown: [f32; 3]| Self { shown, varies: false };
+        let constant = |shown: [f32; 3]| Self { shown, of_steps: shown };
         if let Some(given) = config.background {
             return Ok(constant(given));
         }
@@ -72,17 +70,11 @@ impl Background {
             Some((color, count)) if count as f64 >= BACKDROP * pixels as f64 => {
                 constant(color.map(|value| f32::from(value) / 255.0))
             }
-            _ => Self { shown: sum.map(|sum| (sum / (255.0 * pixels.max(1) as f64)) as f32), varies: true },
+            _ => {
+                let shown = sum.map(|sum| (sum / (255.0 * pixels.max(1) as f64)) as f32);
+                Self { shown, of_steps: shown.map(|value| if value < 0.5 { 1.0 } else { 0.0 }) }
+            }
         })
-    }
-
-    /// The background of a step, counted over all stages.
-    pub(crate) fn of_step(&self, seed: u64, step: u64) -> [f32; 3] {
-        if !self.varies {
-            return self.shown;
-        }
-        let mut rng = stream(seed, Purpose::Backgrounds, step);
-        std::array::from_fn(|_| rng.random())
     }
 }
 

@@ -39,8 +39,6 @@ pub(crate) enum Purpose {
     HeadCameras = 16,
     /// Views that changes of the set of Gaussians are decided by.
     Contributions = 17,
-    /// Colours behind everything.
-    Backgrounds = 18,
 }
 
 /// The stream of a purpose; `counter` distinguishes its uses.

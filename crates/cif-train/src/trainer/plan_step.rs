@@ -113,7 +113,7 @@ impl Trainer {
             views,
             settings: RenderSettings {
                 instances: self.state.instance_settings().filter(|_| with_instances),
-                background: self.state.background.of_step(config.seed, self.state.progress.total_steps + 1),
+                background: self.state.background.of_steps,
                 ..self.state.color_settings()
             },
             trains_head: false,
