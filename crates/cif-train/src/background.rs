@@ -1,9 +1,9 @@
 //! The colour behind everything, which shows where no Gaussian is.
 //!
 //! What has its colour needs no Gaussians, and leaves as a hole. So where the images of a capture are full of scene, steps
-//! have the colour that is farthest from them, and only what is opaque explains them. Scenes show what lies beyond the
-//! images then in the mean colour at their borders: of all colours the one that is least far from what would be there, in
-//! the mean squared error.
+//! have a colour that is far from them, and only what is opaque explains them. Scenes show what lies beyond the images
+//! then in the mean colour at their borders: of all colours the one that is least far from what would be there, in the
+//! mean squared error.
 
 use std::collections::HashMap;
 
@@ -72,10 +72,17 @@ impl Background {
             }
             _ => {
                 let shown = sum.map(|sum| (sum / (255.0 * pixels.max(1) as f64)) as f32);
-                Self { shown, of_steps: shown.map(|value| if value < 0.5 { 1.0 } else { 0.0 }) }
+                Self { shown, of_steps: farther(shown) }
             }
         })
     }
+}
+
+/// Black or white, whichever is farther from a colour. Saturated colours, and another colour in every step, were tried:
+/// against them Gaussians grew that are as large as the scene, and hide it from elsewhere.
+fn farther(color: [f32; 3]) -> [f32; 3] {
+    let brightness = color.iter().sum::<f32>() / 3.0;
+    [if brightness < 0.5 { 1.0 } else { 0.0 }; 3]
 }
 
 /// Pixels at the border of an image.

@@ -33,8 +33,8 @@ pub struct TrainConfig {
     pub downscale: Option<u32>,
     /// Colour behind everything, display-referred RGB in [0, 1]. Default none: white where images have transparent
     /// pixels, and the colour of a backdrop where a quarter of the pixels at their borders has exactly one; else scenes
-    /// show the mean colour at these borders, and steps have the one farthest from it, so that nothing shows through. White
-    /// in `paper`.
+    /// show the mean colour at these borders, and steps have black or white, whichever is farther from it, so that nothing
+    /// shows through. White in `paper`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub background: Option<[f32; 3]>,
     /// Gaussians nearer to the camera than this are not drawn, units of the capture. Default 0: as near as its points

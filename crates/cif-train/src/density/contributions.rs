@@ -8,6 +8,8 @@ pub struct Contributions {
     /// Blending weights over the pixels of the view that shows most of it, `max over views of sum w`, pixels: what few
     /// views show counts as much as what all do.
     pub weight: Vec<f32>,
+    /// The same over the pixels of all views, `sum w`.
+    pub total: Vec<f32>,
     /// Errors of the pixels of all views by the same weights, `sum w |rendered - image|`, pixels times the mean over
     /// channels of values in [0, 1].
     pub error: Vec<f32>,
@@ -17,15 +19,25 @@ impl Contributions {
     /// No contribution of `n` Gaussians yet.
     #[must_use]
     pub fn zeros(n: usize) -> Self {
-        Self { weight: vec![0.0; n], error: vec![0.0; n] }
+        let none = vec![0.0; n];
+        Self { weight: none.clone(), total: none.clone(), error: none }
     }
 
     /// Adds a view: weight and error of every Gaussian there, `[N, 2]`.
     pub fn add_view(&mut self, sums: &[f32]) {
-        for ((weight, error), sums) in self.weight.iter_mut().zip(&mut self.error).zip(sums.chunks_exact(2)) {
-            *weight = weight.max(sums[0]);
-            *error += sums[1];
+        for (row, sums) in sums.chunks_exact(2).enumerate() {
+            self.weight[row] = self.weight[row].max(sums[0]);
+            self.total[row] += sums[0];
+            self.error[row] += sums[1];
         }
+    }
+
+    /// Error of a Gaussian in the view that shows most of it, where it is as wrong as in the mean over its pixels: what few
+    /// views show is as wrong there as what all do.
+    #[must_use]
+    pub fn error_where_shown(&self, row: usize) -> f32 {
+        let share = self.weight[row] / self.total[row].max(f32::MIN_POSITIVE);
+        self.error[row] * share
     }
 
     /// Follows a change of the set: rows that stay keep what they contribute, of others nothing is known.
@@ -34,7 +46,7 @@ impl Contributions {
         let pick = |values: &[f32]| {
             origins.iter().map(|origin| origin.map_or(0.0, |row| values[row as usize])).collect()
         };
-        Self { weight: pick(&self.weight), error: pick(&self.error) }
+        Self { weight: pick(&self.weight), total: pick(&self.total), error: pick(&self.error) }
     }
 }
 

@@ -3,6 +3,8 @@
 //! growth within a budget, Rota Bulo et al. 2024 ("Revising Densification in Gaussian Splatting"); splits along the
 //! longest axis, Deng et al. 2024 ("Efficient Density Control for 3D Gaussian Splatting").
 
+use std::collections::BTreeMap;
+
 use cif_field::Gaussians;
 use cif_geometry::scalar::{logit, sigmoid};
 use rand_pcg::Pcg64;
@@ -74,8 +76,12 @@ impl Strategy for ErrorGuided {
     }
 }
 
+/// Share of the Gaussians of an object that may make room at once: where the views happen to show a sliver of it, all of
+/// them have little weight.
+const AT_ONCE: f64 = 0.5;
+
 /// Removes what is useless, where pruning is due, and, with contributions, so many of those with the least weight that
-/// `densify.turnover` of a full set is free. What no view showed is not judged.
+/// `densify.turnover` of a full set is free. What no view showed is not judged, and of an object goes no more than [`AT_ONCE`].
 fn make_room(
     rows: &Rows<'_>,
     contributions: Option<&Contributions>,
@@ -90,7 +96,17 @@ fn make_room(
         let turnover = (f64::from(config.turnover) * most as f64) as usize;
         let mut shown: Vec<usize> = (0..n).filter(|row| !goes[*row] && weight[*row] > 0.0).collect();
         shown.sort_by(|a, b| weight[*a].total_cmp(&weight[*b]).then(a.cmp(b)));
-        shown.into_iter().take(turnover.saturating_sub(free)).for_each(|row| goes[row] = true);
+        let mut of_objects: BTreeMap<u32, f64> = BTreeMap::new();
+        for object in rows.made_for.iter().filter(|object| **object > 0) {
+            *of_objects.entry(*object).or_default() += AT_ONCE;
+        }
+        let mut may_go = |row: &usize| {
+            let Some(left) = of_objects.get_mut(&rows.made_for[*row]) else { return true };
+            *left -= 1.0;
+            *left >= 0.0
+        };
+        let gone = shown.into_iter().filter(|row| may_go(row)).take(turnover.saturating_sub(free));
+        gone.for_each(|row| goes[row] = true);
     }
     remove(rows, config, &|row| goes[row])
 }
@@ -106,7 +122,7 @@ fn split(
     let (n, most) = (gaussians.len(), config.max_gaussians as usize);
     let factor = (most as f64 / n as f64).powf(1.0 / f64::from(additions_left.max(1)));
     let added = ((n as f64 * factor).ceil() as usize).min(most).saturating_sub(n);
-    let error = &contributions.error;
+    let error: Vec<f32> = (0..n).map(|row| contributions.error_where_shown(row)).collect();
     let mut worst: Vec<u32> = (0..n as u32).filter(|row| error[*row as usize] > 0.0).collect();
     worst.sort_by(|a, b| error[*b as usize].total_cmp(&error[*a as usize]).then(a.cmp(b)));
     worst.truncate(added);

@@ -19,7 +19,8 @@ fn settings(max_gaussians: u32) -> DensifyConfig {
 
 fn removed(gaussians: &Gaussians, weight: &[f32], made_for: &[u32], config: &DensifyConfig) -> Vec<u32> {
     let statistics = DensifyStatistics::zeros(gaussians.len());
-    let contributions = Contributions { weight: weight.to_vec(), error: vec![0.0; weight.len()] };
+    let contributions =
+        Contributions { weight: weight.to_vec(), total: weight.to_vec(), error: vec![0.0; weight.len()] };
     let rows = Rows {
         gaussians,
         statistics: &statistics,
@@ -62,7 +63,12 @@ fn halves_have_mass_mean_and_variance_of_the_whole() {
 #[test]
 fn the_largest_errors_are_split_first_and_the_set_grows_by_equal_factors() {
     let gaussians = row_of(4);
-    let contributions = Contributions { weight: vec![1.0; 4], error: vec![0.1, 0.4, 0.0, 0.3] };
+    // What two views show has twice the sums of what one shows, where it is as wrong.
+    let contributions = Contributions {
+        weight: vec![1.0; 4],
+        total: vec![2.0, 1.0, 2.0, 1.0],
+        error: vec![0.2, 0.4, 0.0, 0.3],
+    };
     let sizes = |additions_left: u32, most: u32| {
         let change = split(&gaussians, &contributions, &settings(most), additions_left)?;
         let fresh: Vec<u32> = change
@@ -96,6 +102,11 @@ fn of_a_full_set_those_of_least_weight_make_room() {
     assert_eq!(removed(&faint, &weight, &free, &settings(8)), [1, 4]);
     // Of an object four stay.
     assert!(removed(&gaussians, &weight, &[1, 1, 1, 1, 0, 0, 0, 0], &settings(8)).is_empty());
+    // Of one that is hardly shown no more than half goes, and others make room.
+    let sliver = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 5.0, 4.0, 3.0, 2.0];
+    let of_object = [1, 1, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0];
+    let half = DensifyConfig { turnover: 0.5, ..settings(12) };
+    assert_eq!(removed(&row_of(12), &sliver, &of_object, &half), [0, 1, 2, 3, 10, 11]);
 }
 
 #[test]
@@ -103,12 +114,14 @@ fn weights_are_those_of_the_view_that_shows_most_and_errors_add_up() {
     let mut contributions = Contributions::zeros(2);
     contributions.add_view(&[3.0, 0.5, 1.0, 0.25]);
     contributions.add_view(&[2.0, 0.5, 4.0, 1.0]);
-    assert_eq!(contributions, Contributions { weight: vec![3.0, 4.0], error: vec![1.0, 1.25] });
+    let expected = Contributions { weight: vec![3.0, 4.0], total: vec![5.0, 5.0], error: vec![1.0, 1.25] };
+    assert_eq!(contributions, expected);
+    assert_eq!([0, 1].map(|row| contributions.error_where_shown(row)), [0.6, 1.0]);
 }
 
 #[test]
 fn nothing_is_known_of_rows_that_are_new() {
-    let before = Contributions { weight: vec![1.0, 2.0], error: vec![3.0, 4.0] };
+    let before = Contributions { weight: vec![1.0, 2.0], total: vec![5.0, 6.0], error: vec![3.0, 4.0] };
     let after = before.gather(&[Some(1), None]);
-    assert_eq!(after, Contributions { weight: vec![2.0, 0.0], error: vec![4.0, 0.0] });
+    assert_eq!(after, Contributions { weight: vec![2.0, 0.0], total: vec![6.0, 0.0], error: vec![4.0, 0.0] });
 }

@@ -1,6 +1,6 @@
 //! Contributions of Gaussians to a few training views, for densification.
 
-use rand::seq::index::sample;
+use rand::{Rng, RngExt};
 
 use super::Trainer;
 use crate::density::Contributions;
@@ -8,7 +8,8 @@ use crate::error::TrainError;
 use crate::random::{Purpose, stream};
 
 impl Trainer {
-    /// Contributions to so many training views, which are drawn anew for every step.
+    /// Contributions to so many training views, which are drawn anew for every step: one of each part of their order, so
+    /// that what is seen for a while is among them.
     ///
     /// # Errors
     /// When the engine fails, a frame cannot be read, or the run is to stop.
@@ -16,8 +17,7 @@ impl Trainer {
         let state = &self.state;
         let (n, frames) = (state.field.gaussians.len(), state.frames.len());
         let mut rng = stream(state.config.seed, Purpose::Contributions, state.progress.total_steps);
-        let mut drawn = sample(&mut rng, frames, views.min(frames)).into_vec();
-        drawn.sort_unstable();
+        let drawn = one_of_each_part(&mut rng, frames, views);
         state.frames.expect(drawn.iter().copied());
         let mut contributions = Contributions::zeros(n);
         for view in drawn {
@@ -28,6 +28,13 @@ impl Trainer {
     }
 }
 
+/// So many of so many frames, in order: one of each part of these, parts as long as each other.
+fn one_of_each_part(rng: &mut impl Rng, frames: usize, count: usize) -> Vec<usize> {
+    let parts = count.min(frames);
+    let bound = |part: usize| part * frames / parts;
+    (0..parts).map(|part| rng.random_range(bound(part)..bound(part + 1))).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use cif_render::Channels;
@@ -36,6 +43,19 @@ mod tests {
     use super::super::guard_tests::support::{Scene, capture, small_config, stopped_after};
     use super::*;
     use crate::density::contributions::error;
+
+    #[test]
+    fn what_is_seen_for_a_while_is_among_the_views() {
+        let mut rng = stream(0, Purpose::Contributions, 0);
+        for _ in 0..50 {
+            let drawn = one_of_each_part(&mut rng, 43, 8);
+            assert_eq!(drawn.len(), 8);
+            // At most six frames lie in a part, so that eleven in a row hold one.
+            let last = drawn.iter().filter(|frame| **frame >= 32).count();
+            assert!(last >= 1 && drawn.is_sorted() && drawn[7] < 43, "{drawn:?}");
+        }
+        assert_eq!(one_of_each_part(&mut rng, 3, 8), [0, 1, 2]);
+    }
 
     #[test]
     fn weights_add_up_to_coverage_and_errors_to_covered_errors() {

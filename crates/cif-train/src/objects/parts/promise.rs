@@ -53,7 +53,7 @@ impl<'a> Search<'a> {
         let stands = self.object.surroundings.plane;
         let mut tried = self.tried_of(closed, guesses(&sides, stands));
         let as_it_is = JointValues::open(vec![0.0]);
-        let (_, uncut) = search(closed, &self.times(LOOKS), &as_it_is, self.level());
+        let (_, uncut) = search(closed, &self.times(LOOKS), &as_it_is, self.coarse_level());
         let best = tried.iter().map(|tried| tried.loss).fold(f64::INFINITY, f64::min);
         if best > PROMISE * uncut {
             return Vec::new();
@@ -83,7 +83,7 @@ impl<'a> Search<'a> {
 
     /// Guesses about a body with their values.
     fn tried_of(&self, body: &Body<'a>, guesses: Vec<Guess>) -> Vec<TriedGuess> {
-        let (times, level) = (self.times(LOOKS), self.level());
+        let (times, level) = (self.times(LOOKS), self.coarse_level());
         let try_one = |guess: Guess| {
             let body = self.cut(body, &guess)?;
             let (values, loss) = search(&body, &times, &guess.values, level);

@@ -26,6 +26,9 @@ const ROWS: usize = 7;
 const ROW: usize = 4;
 const FEWEST_IN_ROW: usize = 4;
 
+/// Pixels that the mask of an object has at least where guesses are fitted, and where they are tried.
+const PIXELS: [f64; 2] = [375.0, 100.0];
+
 /// Gaussians of an object that bends.
 const BENT: usize = 500;
 
@@ -54,11 +57,23 @@ impl<'a> Search<'a> {
         Self { object, base, views, size, up, one_camera }
     }
 
-    /// Reduction at which guesses are compared.
+    /// Reduction at which guesses are fitted: of large masks every other pixel.
     pub(super) fn level(&self) -> usize {
+        self.level_with(PIXELS[0])
+    }
+
+    /// The coarser one at which they are tried first.
+    pub(super) fn coarse_level(&self) -> usize {
+        self.level_with(PIXELS[1])
+    }
+
+    /// The coarsest reduction that leaves a mask so many pixels, in the median.
+    fn level_with(&self, pixels: f64) -> usize {
         let mut areas: Vec<f64> =
             self.views.train.iter().map(|view| self.object.views[*view].detail()).collect();
-        usize::from(median(&mut areas) > 1500.0)
+        let area = median(&mut areas);
+        let levels = self.object.views.first().map_or(1, |view| view.crops.len());
+        (1..levels).take_while(|level| area > pixels * 4.0_f64.powi(*level as i32)).count()
     }
 
     /// Gaussians inside the masks in poses, within a bound in the frame of the object.

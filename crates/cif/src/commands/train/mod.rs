@@ -31,7 +31,7 @@ use budget::{Goals, Timing};
 use watch::{Opening, Watch};
 
 /// Most seconds of measuring steps, once three are done, and the steps of a run from which they are.
-const MEASURING_S: f64 = 0.5;
+const MEASURING_S: f64 = 1.0;
 const LONG: u32 = 1_000;
 
 /// Train a scene on a capture
