@@ -81,7 +81,8 @@ impl Strategy for ErrorGuided {
 const AT_ONCE: f64 = 0.5;
 
 /// Removes what is useless, where pruning is due, and, with contributions, so many of those with the least weight that
-/// `densify.turnover` of a full set is free. What no view showed is not judged, and of an object goes no more than [`AT_ONCE`].
+/// `densify.turnover` of a full set is free. What no view showed is not judged, and of an object goes no more than
+/// [`AT_ONCE`].
 fn make_room(
     rows: &Rows<'_>,
     contributions: Option<&Contributions>,
