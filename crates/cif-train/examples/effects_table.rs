@@ -99,7 +99,7 @@ fn score(dataset: &Dataset, choice: &str, is_dark: bool) -> Result<Score, Box<dy
     let mut config = small_config();
     config.stages.fine = 600;
     if is_dark {
-        config.background = [0.0; 3];
+        config.background = Some([0.0; 3]);
     }
     EffectPlan::new(dataset, &config, &choice.parse()?)?.apply(&mut config);
     if config.effects.still_every > 0 {
