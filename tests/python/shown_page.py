@@ -182,6 +182,7 @@ class NodeSplats:
     def __init__(self, field: cif.Field, document: dict[str, Any]) -> None:
         counts = [node["splats"]["count"] for node in document["nodes"]]
         self.field, self.nodes = field, np.repeat(np.arange(len(counts)), counts)
+        self.background = tuple(document["background"])
         self.by_node = np.array([node["color"] for node in document["nodes"]])[self.nodes] / 255
         assert len(self.nodes) == len(field) and field.sh_degree == 1
 
@@ -201,5 +202,6 @@ class NodeSplats:
             colors=colors[rows].clip(0, None).astype(np.float32),
             identities=nodes,
             instances=[{"id": k + 1, "label": str(k), "category": ""} for k in range(nodes.shape[1])],
+            background=self.background,
         )
         return field.render(camera)
