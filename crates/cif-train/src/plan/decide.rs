@@ -347,7 +347,8 @@ impl Plan<'_> {
             effect: EffectKind::Background,
             decision: Decision::Value(self.config.background.map_or("automatic".to_owned(), given)),
             evidence: match self.config.background {
-                _ if self.found.has_alpha => "images have alpha: what is transparent shows it",
+                None if self.found.has_alpha => "images have alpha: white, where some of it is transparent",
+                Some(_) if self.found.has_alpha => "images have alpha and are laid over it",
                 None => "images are opaque: the mean colour at their borders, or that of a backdrop",
                 Some(_) => "images are opaque: it shows only where no Gaussian is",
             }

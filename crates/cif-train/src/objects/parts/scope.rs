@@ -57,7 +57,7 @@ impl<'a> Search<'a> {
         Self { object, base, views, size, up, one_camera }
     }
 
-    /// Reduction at which guesses are fitted: of large masks every other pixel.
+    /// Reduction at which guesses are fitted.
     pub(super) fn level(&self) -> usize {
         self.level_with(PIXELS[0])
     }
