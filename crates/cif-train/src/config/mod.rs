@@ -317,6 +317,10 @@ pub struct InstanceConfig {
     pub occupancy: f32,
     /// Occupancy is kept within these limits, default [0.005, 0.999].
     pub occupancy_limits: [f32; 2],
+    /// Occupancy of a Gaussian behind the stage, at most, as a multiple of its opacity, default 2: what colours hardly use
+    /// does not hide other objects. An object of which its masks would show less keeps its occupancies; 0, as in `paper`,
+    /// for no such bound.
+    pub occupancy_per_opacity: f32,
     /// Log-calibrations are kept within plus and minus this, default 10.
     pub calibration_limit: f32,
     /// Loss normalisation, `none` (default) or `coverage` (A3).

@@ -236,6 +236,17 @@ mod tests {
         assert!(restored(late).is_none(), "a value at a time that the capture does not have");
     }
 
+    #[test]
+    fn what_rounds_to_zero_is_shown_without_a_sign() {
+        let mut jointed = part(0.1);
+        jointed.second = None;
+        jointed.part.values = BTreeMap::from([(0, -0.004), (1, 0.5)]);
+        assert_eq!(jointed.told(), "a part turns on a hinge, 0 to 29 deg");
+        jointed.part.hinge.kind = JointKind::Prismatic;
+        jointed.part.values = BTreeMap::from([(0, -0.0004), (1, 0.0623)]);
+        assert_eq!(jointed.told(), "a part slides, 0.000 to 0.062");
+    }
+
     fn bending(knot: usize) -> Bending {
         let knots = vec![[[0.25; 3]; 10]; 2];
         let shifts = serde_json::json!({ "first": 1, "knot": knot, "size": 0.5, "knots": knots });

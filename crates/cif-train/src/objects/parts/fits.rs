@@ -280,15 +280,16 @@ impl Jointed {
         let of = |(k, part): (usize, &JointedPart)| {
             let (low, high) = range(&part.values);
             let name = if k == 0 { "a part" } else { "another part" };
+            // No "-0": what rounds to zero has no sign.
             match part.hinge.kind {
                 JointKind::Revolute => {
-                    format!(
-                        "{name} turns on a hinge, {:.0} to {:.0} deg",
-                        low.to_degrees(),
-                        high.to_degrees()
-                    )
+                    let [low, high] = [low, high].map(|angle| angle.to_degrees().round() + 0.0);
+                    format!("{name} turns on a hinge, {low:.0} to {high:.0} deg")
                 }
-                JointKind::Prismatic => format!("{name} slides, {low:.3} to {high:.3}"),
+                JointKind::Prismatic => {
+                    let [low, high] = [low, high].map(|shift| (shift * 1e3).round() / 1e3 + 0.0);
+                    format!("{name} slides, {low:.3} to {high:.3}")
+                }
             }
         };
         self.parts().enumerate().map(of).collect::<Vec<_>>().join(" and ")

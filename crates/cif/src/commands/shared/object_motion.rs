@@ -98,9 +98,11 @@ impl std::fmt::Display for ObjectMotion {
             }
             Self::Parts { joints } => {
                 f.write_str("parts")?;
-                for JointMotion { joint, axis: [x, y, z], range: [low, high], .. } in joints {
+                for JointMotion { joint, axis, range, .. } in joints {
                     let unit = if *joint == JointKind::Revolute { " deg" } else { "" };
                     let digits = if *joint == JointKind::Revolute { 1 } else { 3 };
+                    let [x, y, z] = axis.map(|value| unsigned_zero(value, 2));
+                    let [low, high] = range.map(|value| unsigned_zero(value, digits));
                     write!(f, ", {joint} joint along ({x:.2}, {y:.2}, {z:.2})")?;
                     write!(f, " from {low:.digits$} to {high:.digits$}{unit}")?;
                 }
@@ -110,6 +112,11 @@ impl std::fmt::Display for ObjectMotion {
             Self::Free { moving } => write!(f, "free, {moving} Gaussians move"),
         }
     }
+}
+
+/// The value, but 0 in place of what shows as "-0" with so many digits.
+fn unsigned_zero(value: f64, digits: usize) -> f64 {
+    if value.abs() < 0.5 * 0.1_f64.powi(digits as i32) { 0.0 } else { value }
 }
 
 fn group_of(field: &Field, row: u32) -> Option<&TrackGroup> {
@@ -154,5 +161,25 @@ fn rigid(group: &TrackGroup, world_per_unit: f64) -> ObjectMotion {
         turns_deg: largest(&|k| group.poses[k].rotation.angle_between(first.rotation)).to_degrees(),
         rotation: group.rotation,
         hidden: group.visibility.iter().any(|step| !step.visible),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn joints_show_no_negative_zero() {
+        let joints = vec![JointMotion {
+            joint: JointKind::Revolute,
+            axis: [-0.001, 0.0, -1.0],
+            through: [0.0; 3],
+            range: [-0.03, 27.5],
+            gaussians: 100,
+        }];
+        assert_eq!(
+            ObjectMotion::Parts { joints }.to_string(),
+            "parts, revolute joint along (0.00, 0.00, -1.00) from 0.0 to 27.5 deg"
+        );
     }
 }
