@@ -1,6 +1,7 @@
 //! Decisions on effects, by what a capture shows and what the user says instead.
 
 use cif_field::TimeEncoding;
+use cif_geometry::spherical_harmonics::coefficient_count;
 
 use super::choice::{Basis, EffectChoice};
 use super::effect::{Decision, Effect, EffectKind, Extent};
@@ -14,6 +15,11 @@ const STATIC_CHANGE: f64 = 5e-4;
 
 /// Angle between views up to which colour cannot be shown to depend on the view, degrees.
 const FEW_DIRECTIONS: f64 = 4.0;
+
+/// Highest degree of spherical harmonics whose coefficients, `(degree + 1)^2` per channel, as many places determine.
+pub(super) fn determined_degree(places: usize) -> u8 {
+    (1..=3).take_while(|degree| coefficient_count(*degree) <= places).last().unwrap_or(0)
+}
 
 /// Ratio of footprints from which the low-pass filter of the nearest views would hide detail, or that of the
 /// farthest would thicken it.
@@ -183,24 +189,26 @@ impl Plan<'_> {
 
     /// Nothing where the preset has no degree above 0.
     fn view_dependence(&self) -> Option<Effect> {
-        let (degree, angle) = (self.config.model.sh_degree, self.found.view_angle);
-        let few = angle < FEW_DIRECTIONS;
+        let Evidence { view_angle: angle, places, .. } = *self.found;
+        let asked = self.config.model.sh_degree;
+        let degree = asked.min(determined_degree(places));
+        let few = angle < FEW_DIRECTIONS || degree == 0;
         let case = || Case {
             kind: EffectKind::ViewDependence,
             auto: if few { Extent::Off } else { Extent::Needed },
             full: Extent::Full,
             words: format!("up to degree {degree} while it helps"),
             evidence: if few {
-                format!("views differ by {angle:.1} degrees at most")
+                format!("views differ by {angle:.1} degrees at most, from {places} places")
             } else {
                 format!(
-                    "views differ by up to {angle:.0} degrees; degrees are judged in training, on pixels that are held \
-                     out"
+                    "views from {places} places differ by up to {angle:.0} degrees; degrees are judged in training, on \
+                     pixels that are held out"
                 )
             },
             cost: "720 bytes per Gaussian at degree 3, with gradients and moments".to_owned(),
         };
-        (degree > 0).then(|| self.decided(case()))
+        (asked > 0).then(|| self.decided(case()))
     }
 
     fn instances(&self, has_masks: bool) -> Effect {

@@ -62,6 +62,8 @@ pub(super) struct Evidence {
     pub footprint_ratio: f64,
     /// Largest angle between directions from which training cameras see the middle of the points, degrees.
     pub view_angle: f64,
+    /// Places that training frames were taken from: of a camera that stays where it is one, of others all of their frames.
+    pub places: usize,
     /// Size of the largest training image, pixels.
     pub image_size: [u32; 2],
     /// Training frames whose lens is removed.
@@ -96,6 +98,7 @@ impl Evidence {
         };
         let fixed: Vec<&Vec<(usize, &Frame)>> = several().filter(is_fixed).collect();
         let moving_cameras = several().count() - fixed.len();
+        let places = training.len() - fixed.iter().map(|frames| frames.len() - 1).sum::<usize>();
         let is_compared = dataset.times.len() > 1 && moving_cameras == 0 && !fixed.is_empty();
         let masked: Vec<(usize, &Frame)> =
             training.iter().filter(|(_, frame)| frame.mask.is_some()).copied().collect();
@@ -116,6 +119,7 @@ impl Evidence {
             exposures: exposures(dataset, &cameras, phases)?,
             footprint_ratio: footprint_ratio(dataset, &training),
             view_angle: view_angle(dataset, &training),
+            places,
             image_size: working_size::captured(dataset),
             lenses: training.iter().filter(|(_, frame)| !frame.lens.is_identity()).count(),
             has_alpha: dataset.has_alpha,

@@ -21,7 +21,7 @@ use cif_dataset::Dataset;
 pub use choice::{Basis, EffectChoice};
 pub use effect::{Decision, Effect, EffectKind};
 
-use self::decide::decide;
+use self::decide::{decide, determined_degree};
 use self::effect::Extent;
 use self::evidence::Evidence;
 use crate::config::TrainConfig;
@@ -49,6 +49,8 @@ pub struct EffectPlan {
     pub effects: Vec<Effect>,
     /// Labels of the instances that travel by their masks.
     pub travelling: Vec<String>,
+    /// Highest degree of spherical harmonics that the places of the training frames determine.
+    pub determined_degree: u8,
 }
 
 impl EffectPlan {
@@ -71,7 +73,11 @@ impl EffectPlan {
         phases: &Phases,
     ) -> Result<Self, TrainError> {
         let evidence = Evidence::of(dataset, phases)?;
-        Ok(Self { effects: decide(&evidence, config, choice), travelling: evidence.travelling })
+        Ok(Self {
+            effects: decide(&evidence, config, choice),
+            determined_degree: determined_degree(evidence.places),
+            travelling: evidence.travelling,
+        })
     }
 
     /// Decision on an effect.
@@ -89,6 +95,9 @@ impl EffectPlan {
                 Decision::Value(_) => Extent::Needed,
             };
             set(effect.effect, extent, config);
+            if (effect.effect, extent) == (EffectKind::ViewDependence, Extent::Needed) {
+                config.model.sh_degree = config.model.sh_degree.min(self.determined_degree);
+            }
         }
     }
 }

@@ -17,6 +17,7 @@ fn found() -> Evidence {
         exposures: None,
         footprint_ratio: 1.3,
         view_angle: 50.0,
+        places: 60,
         image_size: [256, 192],
         lenses: 0,
         has_alpha: false,
@@ -29,12 +30,13 @@ fn exposed(cameras: usize, between_cameras: f64, in_time: Option<f64>) -> Option
 }
 
 fn of(effects: Vec<Effect>) -> EffectPlan {
-    EffectPlan { effects, travelling: Vec::new() }
+    EffectPlan { effects, travelling: Vec::new(), determined_degree: 3 }
 }
 
 fn plan(found: &Evidence, choice: &str) -> (EffectPlan, TrainConfig) {
     let mut config = TrainConfig::default();
-    let plan = of(decide(found, &config, &choice.parse().unwrap()));
+    let effects = decide(found, &config, &choice.parse().unwrap());
+    let plan = EffectPlan { determined_degree: determined_degree(found.places), ..of(effects) };
     plan.apply(&mut config);
     config.validate().unwrap();
     (plan, config)
@@ -103,6 +105,18 @@ fn few_directions_and_many_footprints_count() {
     assert!(config.antialiased);
     let (_, config) = plan(&flat, "all");
     assert_eq!((config.model.sh_degree, config.antialiased), (3, false));
+}
+
+#[test]
+fn few_places_determine_few_coefficients() {
+    assert_eq!([1, 3, 4, 8, 9, 15, 16, 200].map(determined_degree), [0, 0, 1, 1, 2, 2, 3, 3]);
+    let rig = Evidence { places: 5, ..found() };
+    let (rig_plan, config) = plan(&rig, "auto");
+    assert_eq!(config.model.sh_degree, 1);
+    let said = Decision::Value("up to degree 1 while it helps".to_owned());
+    assert_eq!(rig_plan.decision(EffectKind::ViewDependence), Some(&said));
+    assert_eq!(plan(&rig, "all").1.model.sh_degree, 3);
+    assert_eq!(plan(&Evidence { places: 3, ..found() }, "auto").1.model.sh_degree, 0);
 }
 
 #[test]
