@@ -31,15 +31,13 @@ impl StepRates {
         let scheduled = |pair| log_linear(pair, step, schedule_steps(config));
         let network = |pair| scheduled(pair) * if rates.network_follows_extent { field.extent } else { 1.0 };
         let only_if = |condition: bool, rate: f32| if condition { rate } else { 0.0 };
-        let own_occupancy =
-            !config.ablates(Ablation::ConstantOccupancy) && !config.ablates(Ablation::OpacityOccupancy);
         let calibrates = !config.ablates(Ablation::NoCalibration);
         let of = |parameter: &Parameter| match parameter.rate {
             "means" => scheduled(rates.means) * field.extent,
             "log_scales" => rates.log_scales,
             "quaternions" => rates.quaternions,
             "opacity" => rates.opacity,
-            "occupancy" => only_if(in_instance_stage && own_occupancy, rates.occupancy),
+            "occupancy" => only_if(in_instance_stage && config.trains_occupancy(), rates.occupancy),
             "planes" => network(rates.planes),
             "mlp" => network(rates.mlp),
             "calibration" => only_if(in_instance_stage && calibrates, rates.calibration),

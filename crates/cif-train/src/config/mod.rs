@@ -300,7 +300,8 @@ pub struct IdentityConfig {
     /// Occupancy of unseen Gaussians without neighbours, default 0.005.
     pub unseen_occupancy: f32,
     /// Rounds of expectation maximisation, after the instance stage, for how much of each Gaussian is an instance's
-    /// rather than of the unlabelled rest, default 4; 0, as in `paper`, leaves what was counted.
+    /// rather than of the unlabelled rest, default 4; occupancies are multiplied by it. 0, as in `paper`, leaves what was
+    /// counted, and occupancies as they are.
     pub share_rounds: u32,
     /// Estimates again every so many steps of the instance stage, folding calibration in; default 0: once
     /// (A16).
@@ -317,10 +318,6 @@ pub struct InstanceConfig {
     pub occupancy: f32,
     /// Occupancy is kept within these limits, default [0.005, 0.999].
     pub occupancy_limits: [f32; 2],
-    /// Occupancy of a Gaussian behind the stage, at most, as a multiple of its opacity, default 2: what colours hardly use
-    /// does not hide other objects. An object of which its masks would show less keeps its occupancies; 0, as in `paper`,
-    /// for no such bound.
-    pub occupancy_per_opacity: f32,
     /// Log-calibrations are kept within plus and minus this, default 10.
     pub calibration_limit: f32,
     /// Loss normalisation, `none` (default) or `coverage` (A3).
@@ -480,6 +477,11 @@ impl TrainConfig {
     #[must_use]
     pub fn ablates(&self, ablation: Ablation) -> bool {
         self.instance.ablate.contains(&ablation)
+    }
+
+    /// True when occupancies are parameters of their own that are trained.
+    pub(crate) fn trains_occupancy(&self) -> bool {
+        !self.ablates(Ablation::ConstantOccupancy) && !self.ablates(Ablation::OpacityOccupancy)
     }
 }
 

@@ -10,12 +10,11 @@ fn removed() -> [(&'static str, Value); 2] {
 }
 
 /// Settings that there were not, with the value that runs went by.
-fn added() -> [(&'static str, Value); 8] {
+fn added() -> [(&'static str, Value); 7] {
     [
         ("/resample/weakness", "occupancy".into()),
         ("/model/triangulate", false.into()),
         ("/identity/share_rounds", 0.into()),
-        ("/instance/occupancy_per_opacity", 0.into()),
         ("/densify/rule", "gradient".into()),
         ("/stages/half_size", 0.into()),
         ("/stages/reduction", 1.into()),
@@ -72,14 +71,12 @@ mod tests {
         json["stages"].as_object_mut().unwrap().remove("half_size");
         json["stages"].as_object_mut().unwrap().remove("reduction");
         json["densify"].as_object_mut().unwrap().remove("detail");
-        json["instance"].as_object_mut().unwrap().remove("occupancy_per_opacity");
         let former = TrainConfig::recorded(json.clone()).unwrap();
         assert_eq!(
             (former.resample.weakness, former.densify.rule, former.stages.half_size),
             (Weakness::Occupancy, DensifyRule::Gradient, 0.0)
         );
         assert_eq!((former.stages.reduction, former.densify.detail), (1, 0.0));
-        assert_eq!(former.instance.occupancy_per_opacity, 0.0);
         json["stages"]["tile_share"] = 0.5.into();
         let error = TrainConfig::recorded(json).unwrap_err();
         assert!(error.contains("stages.tile_share = 0.5"), "{error}");

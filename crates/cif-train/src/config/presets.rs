@@ -118,7 +118,6 @@ fn paper(layout: Layout) -> TrainConfig {
     };
     config.instance.geometry = super::InstanceGeometry::Full;
     config.identity.share_rounds = 0;
-    config.instance.occupancy_per_opacity = 0.0;
     config.resample = ResampleConfig {
         from: 100,
         until: 2_500,
@@ -340,7 +339,6 @@ impl Default for InstanceConfig {
             occupancy_start: super::OccupancyStart::Constant,
             occupancy: 0.02,
             occupancy_limits: [0.005, 0.999],
-            occupancy_per_opacity: 2.0,
             calibration_limit: 10.0,
             normalisation: super::Normalisation::None,
             geometry: super::InstanceGeometry::Off,

@@ -216,7 +216,6 @@ impl TrainConfig {
             format!("{:?}", instance.occupancy_limits),
             "expected a lower and a higher number inside (0, 1)",
         )?;
-        non_negative("instance.occupancy_per_opacity", instance.occupancy_per_opacity)?;
         positive("instance.calibration_limit", instance.calibration_limit)?;
         check(
             !(self.ablates(Ablation::ConstantOccupancy) && self.ablates(Ablation::OpacityOccupancy)),

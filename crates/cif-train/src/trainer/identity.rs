@@ -15,15 +15,11 @@ use crate::events::TrainEvent;
 const HELD_AGAINST: usize = 100;
 
 /// Views that identities are estimated from, of so many training views, and those that they are held against behind the
-/// instance stage, each as often as that is done: once for what masks contradict, twice for what occupancies show, and in
-/// every round of shares.
+/// instance stage, each as often as that is done: once for what masks contradict, and in every round of shares.
 pub(crate) fn identity_views(config: &TrainConfig, views: usize) -> [usize; 2] {
     let all = views.div_ceil(config.identity.stride.max(1) as usize);
     let rounds = match config.head.name {
-        HeadName::Cif if config.stages.instance > 0 => {
-            let of_occupancies = if config.instance.occupancy_per_opacity > 0.0 { 2 } else { 0 };
-            1 + of_occupancies + config.identity.share_rounds as usize
-        }
+        HeadName::Cif if config.stages.instance > 0 => 1 + config.identity.share_rounds as usize,
         _ => 0,
     };
     [all, rounds * all.div_ceil(all.div_ceil(HELD_AGAINST).max(1))]

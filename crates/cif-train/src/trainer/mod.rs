@@ -14,7 +14,6 @@
 //! | `identity` | how identity rows come about |
 //! | `shares` | how much of a Gaussian is of any instance |
 //! | `contradicted` | which Gaussians masks show to be of no instance |
-//! | `occupancy` | which occupancies colours bear out |
 //! | `continued` | where bodies are before the first and after the last training frame |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
 //! | `saved`, `resume` | what is saved, and how a run resumes |
@@ -60,7 +59,6 @@ mod measure;
 mod measured_frames;
 mod near;
 mod objects;
-mod occupancy;
 mod pace;
 mod pacing;
 mod parts;

@@ -253,12 +253,9 @@ impl Trainer {
         if stage == Stage::Instance {
             // Nothing behind the first change may be stopped: it must not be done twice.
             let contradicted = self.contradicted()?;
-            let occupancies = self.borne_out_occupancies()?;
             self.sharpen_shares()?;
             self.disown(&contradicted);
-            if let Some(logits) = occupancies {
-                self.occupy(logits);
-            }
+            self.occupy_by_shares();
         }
         let wall_s = self.progress().stages_s.get(stage.name()).copied().unwrap_or(0.0);
         let gaussians = self.state.field.gaussians.len();

@@ -7,6 +7,7 @@
 //!
 //! `s' = s P / (s P + (1 - s) Q)`, `P = sum over labelled pixels of w / F`, `Q = sum over the others of w / (A - F)`.
 
+use cif_geometry::scalar::{logit, sigmoid};
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::{BlendRequest, Blending, UNLABELLED};
 
@@ -15,6 +16,7 @@ use crate::config::{HeadName, IdentityConfig};
 use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::phase::Phase;
+use crate::state::State;
 
 /// Shares are kept this far from 0 and 1, where no evidence moves them any more.
 const LIMIT: f32 = 1e-3;
@@ -60,6 +62,25 @@ impl Trainer {
         Ok(())
     }
 
+    /// Multiplies occupancies by the shares: what belongs to no instance is part of the surface of none.
+    ///
+    /// Masks say what is seen along a ray, not where on it. A Gaussian that colours hardly use, between a camera and an
+    /// object, can come to stand for the object before that camera; where shares or masks then say that it is of no
+    /// instance, it would still hide other objects from elsewhere.
+    pub(super) fn occupy_by_shares(&mut self) {
+        let State { config, field, .. } = &mut self.state;
+        let is_trained = config.head.name == HeadName::Cif && config.trains_occupancy();
+        let Some(identities) = &field.identities else { return };
+        if !is_trained || config.identity.share_rounds == 0 {
+            return;
+        }
+        let [low, high] = config.instance.occupancy_limits;
+        for (logits, share) in field.gaussians.occupancy_logits.iter_mut().zip(identities.labelled_shares()) {
+            *logits = logit((sigmoid(*logits) * share).clamp(low, high));
+        }
+        self.engine.changed(Changed::Gaussians);
+    }
+
     /// `P` and `Q` of every Gaussian, `[N, 2]`.
     fn evidence(
         &self,
@@ -96,6 +117,7 @@ impl Trainer {
 mod tests {
     use super::super::guard_tests::support::{Scene, capture, small_config, stopped_after};
     use super::*;
+    use crate::config::{Ablation, TrainConfig};
 
     /// Mean logarithm of the probability of what the masks of all training views say.
     fn likelihood(trainer: &Trainer) -> f64 {
@@ -146,5 +168,42 @@ mod tests {
             assert!((after - before).abs() < 1e-5, "which instance it is stays as it was");
         }
         trainer.state.field.validate().unwrap();
+    }
+
+    #[test]
+    fn what_is_of_no_instance_occupies_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), Scene::default());
+        let mut config = small_config();
+        (config.stages.coarse, config.stages.fine, config.stages.instance) = (60, 60, 10);
+        let trained = || stopped_after(&dataset, &config, 125);
+        let mut trainer = trained();
+        let of_ball: Vec<usize> = {
+            let of = trainer.state.field.instance_of_gaussians().unwrap();
+            let shares = trainer.state.field.identities.as_ref().unwrap().labelled_shares();
+            (0..of.len()).filter(|row| of[*row] == Some(0) && shares[*row] > 0.5).collect()
+        };
+        let (ghosts, stay) = of_ball.split_at(5);
+        trainer.state.field.gaussians.occupancy_logits.fill(logit(0.8));
+        trainer.disown(ghosts);
+        let shares = trainer.state.field.identities.as_ref().unwrap().labelled_shares();
+        let [low, _] = config.instance.occupancy_limits;
+        trainer.occupy_by_shares();
+        let occupancy = |row: &usize| trainer.state.field.gaussians.occupancy(*row);
+        assert!(ghosts.iter().all(|row| (occupancy(row) - low).abs() < 1e-5));
+        assert!(
+            !stay.is_empty() && stay.iter().all(|row| (occupancy(row) - 0.8 * shares[*row]).abs() < 1e-5)
+        );
+        // What is held constant, or the published method, stays as it was.
+        for changes in [
+            |config: &mut TrainConfig| config.identity.share_rounds = 0,
+            |config: &mut TrainConfig| _ = config.instance.ablate.insert(Ablation::ConstantOccupancy),
+        ] {
+            let mut trainer = trained();
+            changes(&mut trainer.state.config);
+            let before = trainer.state.field.gaussians.occupancy_logits.clone();
+            trainer.occupy_by_shares();
+            assert_eq!(trainer.state.field.gaussians.occupancy_logits, before);
+        }
     }
 }
